@@ -1,0 +1,109 @@
+"""What an environment is: a Markov decision process written once, as pure functions of one state.
+
+The same functions are sampled by the training loop, enumerated by the planner, wrapped for Gymnasium and drawn as
+pictures, so that none of these can disagree. There is no batch axis (callers `jax.vmap`), no clock, no random key
+inside: nature's draw is the argument `outcome`. Time limits and resets belong to whoever runs the environment.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+
+from lodestone.types import Observation, State
+
+
+class Environment(eqx.Module):
+    """The contract. Parameters are static fields, so that an environment is hashable and holds no arrays unless its
+    dynamics are tables."""
+
+    @property
+    @abstractmethod
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the primitive actions, in order."""
+
+    @property
+    @abstractmethod
+    def num_outcomes(self) -> int:
+        """K, how many draws nature has: 1 in a deterministic world."""
+
+    @abstractmethod
+    def initial_distribution(self) -> tuple[Float[Array, " I"], State]:
+        """Probabilities of the I states in which an episode may begin, and these states, stacked."""
+
+    @abstractmethod
+    def outcome_probs(self, state: State, action: Int[Array, ""]) -> Float[Array, " K"]:
+        """Probabilities of nature's draws."""
+
+    @abstractmethod
+    def transition(self, state: State, action: Int[Array, ""], outcome: Int[Array, ""]) -> State:
+        """The next state, a deterministic function of state, action and nature's draw."""
+
+    @abstractmethod
+    def reward(self, state: State, action: Int[Array, ""], next_state: State) -> Float[Array, ""]:
+        """The reward of one step."""
+
+    @abstractmethod
+    def terminal(self, state: State) -> Bool[Array, ""]:
+        """Whether the episode is over in this state."""
+
+    @abstractmethod
+    def observe(self, state: State) -> Observation:
+        """What the agent sees."""
+
+    @abstractmethod
+    def render(self, state: State) -> UInt8[np.ndarray, "height width 3"]:
+        """What a person sees (runs on the host, not compiled)."""
+
+    @property
+    def num_actions(self) -> int:
+        """A, the number of primitive actions."""
+        return len(self.action_names)
+
+
+class Step(NamedTuple):
+    """What one primitive step brought."""
+
+    state: State
+    reward: Float[Array, ""]
+    terminated: Bool[Array, ""]
+
+
+def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Array, ""]:
+    """An index drawn with the given probabilities; one of probability zero is never drawn.
+
+    Inverse of the cumulative sum: one uniform number a draw, where a Gumbel draw would take K.
+    """
+    edges = jnp.cumsum(probs)
+    threshold = jax.random.uniform(key) * edges[-1]
+    return jnp.sum(threshold >= edges[:-1]).astype(jnp.int32)
+
+
+def sample_initial(environment: Environment, key: PRNGKeyArray) -> State:
+    """The first state of an episode."""
+    probs, states = environment.initial_distribution()
+    if probs.shape[0] == 1:
+        return jax.tree.map(lambda leaf: leaf[0], states)
+    index = sample_categorical(key, probs)
+    return jax.tree.map(lambda leaf: leaf[index], states)
+
+
+def sample_step(environment: Environment, key: PRNGKeyArray, state: State, action: Int[Array, ""]) -> Step:
+    """One primitive step: nature draws, the state moves, the reward is paid."""
+    outcome = jnp.int32(0)
+    if environment.num_outcomes > 1:
+        outcome = sample_categorical(key, environment.outcome_probs(state, action))
+    next_state = environment.transition(state, action, outcome)
+    return Step(next_state, environment.reward(state, action, next_state), environment.terminal(next_state))
+
+
+def example_state(environment: Environment) -> State:
+    """The first of the initial states: an example for shapes and dtypes."""
+    _, states = environment.initial_distribution()
+    return jax.tree.map(lambda leaf: leaf[0], states)

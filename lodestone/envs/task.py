@@ -1,0 +1,59 @@
+"""A task on an environment: the same dynamics with another beginning, end and reward.
+
+The "training environments" of Kuzmin and Panov (2018, section 4.2) are tasks in this sense. The three functions take
+the environment as their first argument, so that they can stand at the top of a module, compare equal between two
+tasks of the same kind, and read the environment's parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from lodestone.envs.base import Environment
+from lodestone.types import Observation, State
+
+
+class Task(Environment):
+    """`environment` with its own `start`, `stop` and `pay`."""
+
+    environment: Environment
+    name: str = eqx.field(static=True)
+    start: Callable[..., tuple[Float[Array, " I"], State]] = eqx.field(static=True)
+    """start(environment) -> the initial distribution."""
+    stop: Callable[..., Bool[Array, ""]] = eqx.field(static=True)
+    """stop(environment, state) -> whether the task is over."""
+    pay: Callable[..., Float[Array, ""]] = eqx.field(static=True)
+    """pay(environment, state, action, next_state) -> the task's reward."""
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        return self.environment.action_names
+
+    @property
+    def num_outcomes(self) -> int:
+        return self.environment.num_outcomes
+
+    def initial_distribution(self) -> tuple[Float[Array, " I"], State]:
+        return self.start(self.environment)
+
+    def outcome_probs(self, state: State, action: Int[Array, ""]) -> Float[Array, " K"]:
+        return self.environment.outcome_probs(state, action)
+
+    def transition(self, state: State, action: Int[Array, ""], outcome: Int[Array, ""]) -> State:
+        return self.environment.transition(state, action, outcome)
+
+    def reward(self, state: State, action: Int[Array, ""], next_state: State) -> Float[Array, ""]:
+        return self.pay(self.environment, state, action, next_state)
+
+    def terminal(self, state: State) -> Bool[Array, ""]:
+        return self.stop(self.environment, state)
+
+    def observe(self, state: State) -> Observation:
+        return self.environment.observe(state)
+
+    def render(self, state: State) -> UInt8[np.ndarray, "height width 3"]:
+        return self.environment.render(state)

@@ -1,0 +1,44 @@
+"""Every error that bad input can cause, each a named exception whose message is one sentence for a person.
+
+The command line prints the message and leaves with exit code 2; a library user catches the class.
+"""
+
+from __future__ import annotations
+
+
+class LodestoneError(ValueError):
+    """Base of all errors that Lodestone raises on purpose."""
+
+
+class InvalidConfig(LodestoneError):
+    """A parameter is outside what is allowed; the message says which, and what is."""
+
+
+class UnknownName(LodestoneError):
+    """A name of an environment, agent, option, preset or experiment that does not exist."""
+
+
+class NoOptionAvailable(LodestoneError):
+    """A reachable state where no option may start."""
+
+
+class BadFile(LodestoneError):
+    """A file that is missing, truncated, foreign, or saved for another problem."""
+
+
+class CannotWrite(LodestoneError):
+    """An output folder or file that cannot be written."""
+
+
+class TooManyStates(LodestoneError):
+    """More reachable states than an exact method was allowed to enumerate."""
+
+
+class Diverged(LodestoneError):
+    """A loss or a parameter stopped being a finite number during training."""
+
+
+def check_name(kind: str, name: str, known: tuple[str, ...]) -> None:
+    """Raise `UnknownName` unless `name` is one of `known`."""
+    if name not in known:
+        raise UnknownName(f"There is no {kind} named {name!r}; there are: {', '.join(known)}.")
