@@ -10,13 +10,17 @@ so that a whole column is tested, lifted from and dropped into by a few integer 
 
 from __future__ import annotations
 
-from functools import cache
+import math
+from contextlib import nullcontext
+from functools import cache, partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float, Int, UInt, UInt8
 
 from lodestone.envs.base import Environment
@@ -179,16 +183,10 @@ class MagnetArm(Environment):
         code; `index`: int32 [], the state's number in `reachable_states`."""
         if self.observation == "index":
             return reachable_states(self).index_of(state)
-        codes = self.cell_codes(state)
         if self.observation == "planes":
+            codes = self.cell_codes(state)
             return (codes[..., None] == jnp.arange(4, dtype=jnp.uint8)).astype(jnp.uint8)
-        side = self.pixels_per_cell
-        cells = codes[:, None, :, None, None]
-        colours = jnp.asarray(PALETTE).reshape(4, 1, 1, 1, 1, 3)
-        glyph = _arm_glyph(side)[None, :, None, :, None]
-        arm = jnp.where(cells == ARM_ON, colours[ARM_ON], jnp.where(cells == ARM_OFF, colours[ARM_OFF], colours[EMPTY]))
-        picture = jnp.where(cells == BRICK, colours[BRICK], jnp.where(glyph, arm, colours[EMPTY]))
-        return picture.reshape(self.rows * side, self.columns * side, 3)
+        return _picture(self, state)
 
     def render(self, state: ArmState) -> UInt8[np.ndarray, "height width 3"]:
         from lodestone.envs.magnet_arm_picture import draw  # Pillow is only needed to draw for people
@@ -203,10 +201,36 @@ def tower_heights(state: ArmState) -> Int[Array, " columns"]:
     return lax.population_count(bricks ^ (bricks + 1)) - 1
 
 
-def _arm_glyph(side: int) -> Bool[np.ndarray, "side side"]:
-    """An inverted T: the middle column of a cell and its bottom row."""
-    index = np.arange(side)
-    return (index[None, :] == side // 2) | (index[:, None] == side - 1)
+def _picture(arm: MagnetArm, state: ArmState) -> UInt8[Array, "height width 3"]:
+    """The agent's picture: cells of `pixels_per_cell` x `pixels_per_cell` pixels in the colours of `PALETTE`."""
+    side = arm.pixels_per_cell
+    # On a CPU, XLA merges the last reshape into the loop that computes the bytes, whose innermost length is then 3
+    # instead of the whole picture: ten times slower. A call that is not inlined keeps the two apart.
+    on_cpu = jax.default_backend() == "cpu"
+    with set_xla_metadata(inlineable="false") if on_cpu else nullcontext():
+        picture = _picture_bytes(arm, state)
+    return picture.reshape(arm.rows * side, arm.columns * side, 3)
+
+
+@partial(jax.jit, static_argnums=0)
+def _picture_bytes(arm: MagnetArm, state: ArmState) -> UInt8[Array, " bytes"]:
+    """The picture's bytes in one row: what a byte may show is known beforehand, the state chooses among it."""
+    side = arm.pixels_per_cell
+    shape = (arm.rows * side, arm.columns * side, 3)
+    pixel_row, pixel_column, channel = np.unravel_index(np.arange(math.prod(shape)), shape)
+    row, column = pixel_row // side, pixel_column // side
+
+    brick_here = jnp.zeros(len(row), dtype=state.bricks.dtype)
+    for each in range(arm.columns):
+        bit = np.where(column == each, 1 << (arm.rows - 1 - row), 0)
+        brick_here |= state.bricks[each] & bit.astype(state.bricks.dtype)
+    arm_here = (row.astype(state.row.dtype) == state.row) & (column.astype(state.column.dtype) == state.column)
+
+    # The arm's shape is an inverted T: the middle column of its cell and the bottom row.
+    glyph = (pixel_column % side == side // 2) | (pixel_row % side == side - 1)
+    arm_on, arm_off = np.where(glyph, PALETTE[ARM_ON][channel], 0), np.where(glyph, PALETTE[ARM_OFF][channel], 0)
+    arm_colour = jnp.where(state.magnet, arm_on.astype(np.uint8), arm_off.astype(np.uint8))
+    return jnp.where(brick_here != 0, PALETTE[BRICK][channel], jnp.where(arm_here, arm_colour, jnp.uint8(0)))
 
 
 def _at_top(arm: MagnetArm, heights: Int[np.ndarray, "I columns"], column: Int[np.ndarray, " I"]) -> ArmState:

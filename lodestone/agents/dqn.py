@@ -1,0 +1,215 @@
+"""DQN over options (Kuzmin and Panov 2018, algorithm 2; Mnih et al. 2015).
+
+The flat DQN is the same learner with the primitive actions as its options: a primitive is an option of one step, so
+there is one code path. What options change is in the transition: its reward is the discounted sum over the option's
+k steps, its discount is gamma^k, and its maximum runs over the options that may start where the option ended.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from lodestone.envs.base import Environment, example_state
+from lodestone.errors import InvalidConfig
+from lodestone.learning.collecting import collect, no_decisions, start_actors
+from lodestone.learning.loop import Algorithm, RoundLog, log_round
+from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
+from lodestone.learning.policies import epsilon_greedy, mask_unavailable
+from lodestone.learning.replay import Replay, add, empty_replay, sample
+from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
+from lodestone.options.base import Options
+from lodestone.options.execution import Actor, Rules
+from lodestone.types import State, Transition
+
+
+@dataclass(frozen=True)
+class DQNConfig:
+    """Settings of the learner. Lengths are in decisions unless they say otherwise."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Shape of the Q-network."""
+    double: bool = True
+    """Whether the online network picks the option that the target network values (double Q-learning)."""
+    learning_rate: Knots = ((0, 1e-3),)
+    """Adam's step size over the decisions."""
+    adam_epsilon: float = 1e-4
+    """Adam's constant under the fraction."""
+    max_gradient_norm: float = 10.0
+    """Every weight and bias array's gradient is scaled down to this norm."""
+    batch_size: int = 32
+    """Transitions per update; the loss is their summed Huber loss."""
+    replay_capacity: int = 1_000_000
+    """Transitions kept; no more memory is taken than the run can fill."""
+    learning_starts: int = 1000
+    """Decisions before the first update."""
+    target_period: int = 200
+    """Updates between two copies of the network to the target network."""
+    epsilon: Knots = ((0, 1.0), (10_000, 0.05))
+    """Probability of a random option over the decisions."""
+    environments: int = 8
+    """Copies of the environment that one seed runs side by side."""
+    decisions_per_round: int = 8
+    """Decisions between two rounds of updates."""
+    updates_per_round: int = 8
+    """Updates after each round of decisions."""
+    reward_scale: float = 1.0
+    """Factor on rewards inside the learner; values near 10 are learned fastest."""
+
+    def __post_init__(self) -> None:
+        check_knots("learning_rate", self.learning_rate, 0.0, 1.0)
+        check_knots("epsilon", self.epsilon, 0.0, 1.0)
+        for name in (
+            "batch_size",
+            "replay_capacity",
+            "target_period",
+            "environments",
+            "decisions_per_round",
+            "updates_per_round",
+        ):
+            if getattr(self, name) < 1:
+                raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
+        if self.learning_starts < 0:
+            raise InvalidConfig(f"learning_starts is {self.learning_starts}, but must not be negative.")
+        for name in ("adam_epsilon", "max_gradient_norm", "reward_scale"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be a positive number.")
+        if self.decisions_per_round + self.environments - 1 > self.replay_capacity:
+            raise InvalidConfig("replay_capacity must hold at least one round of decisions.")
+
+
+class Learner(NamedTuple):
+    """What is learned, and from what."""
+
+    network: QNetwork
+    target: QNetwork
+    adam: optax.ScaleByAdamState
+    replay: Replay
+
+
+class Carry(NamedTuple):
+    """Everything that one seed carries from round to round."""
+
+    learner: Learner
+    actors: Actor
+    surplus: Int[Array, ""]
+    """Decisions that the last round took beyond its quota; the next round takes so many fewer."""
+    key: PRNGKeyArray
+
+
+def bootstrap_values(
+    network: QNetwork, target: QNetwork, batch: Transition, double: bool
+) -> Float[Array, " B"]:
+    """max over the available options at `next_obs`, valued by the target network."""
+    values = jax.vmap(target)(batch.next_obs)
+    if double:
+        preferences = jax.vmap(mask_unavailable)(jax.vmap(network)(batch.next_obs), batch.next_available)
+        best = jnp.argmax(preferences, axis=1)
+        return jnp.take_along_axis(values, best[:, None], axis=1)[:, 0]
+    return jnp.max(jax.vmap(mask_unavailable)(values, batch.next_available), axis=1)
+
+
+def loss(
+    network: QNetwork, target: QNetwork, batch: Transition, double: bool, reward_scale: float
+) -> Float[Array, ""]:
+    """Huber loss, summed over the batch, of Q(s, o) against R + gamma^k (1 - terminated) max Q'(s', .)."""
+    targets = batch.reward * reward_scale + batch.discount * bootstrap_values(network, target, batch, double)
+    values = jax.vmap(network)(batch.obs)
+    chosen = jnp.take_along_axis(values, batch.action[:, None], axis=1)[:, 0]
+    return jnp.sum(optax.huber_loss(chosen, jax.lax.stop_gradient(targets), delta=1.0))
+
+
+def update(
+    config: DQNConfig,
+    environment: Environment,
+    learner: Learner,
+    key: PRNGKeyArray,
+    learning_rate: Float[Array, ""],
+) -> tuple[Learner, Float[Array, ""]]:
+    """One gradient step on one batch; the target network stays. Returns the mean loss per transition, too."""
+    batch = sample(learner.replay, key, config.batch_size)
+    observe = jax.vmap(environment.observe)
+    batch = batch._replace(obs=observe(batch.obs), next_obs=observe(batch.next_obs))
+    value, gradient = jax.value_and_grad(loss)(
+        learner.network, learner.target, batch, config.double, config.reward_scale
+    )
+    gradient = jax.tree.map(lambda leaf: _clip(leaf, config.max_gradient_norm), gradient)
+    direction, adam = optax.scale_by_adam(eps=config.adam_epsilon).update(gradient, learner.adam)
+    network = jax.tree.map(lambda old, step: old - learning_rate * step, learner.network, direction)
+    return learner._replace(network=network, adam=adam), value / config.batch_size
+
+
+def _clip(gradient: Array, max_norm: float) -> Array:
+    norm = jnp.sqrt(jnp.sum(jnp.square(gradient)))
+    return gradient * jnp.minimum(1.0, max_norm / jnp.maximum(norm, 1e-12))
+
+
+def option_values(network: QNetwork, environment: Environment, state: State) -> Float[Array, " O"]:
+    """Q(s, .), in units of the scaled reward."""
+    return network(environment.observe(state))
+
+
+def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Rules, decisions: int) -> Algorithm:
+    """The algorithm for the training loop. `decisions` bounds the run's length, and so the replay's memory."""
+    slots = config.decisions_per_round + config.environments - 1
+    capacity = max(slots, min(config.replay_capacity, decisions + slots))
+    first_learning_round = config.learning_starts // config.decisions_per_round
+
+    def init(key: PRNGKeyArray) -> Carry:
+        network_key, actor_key, key = jax.random.split(key, 3)
+        shape = jax.eval_shape(environment.observe, example_state(environment)).shape
+        network = init_q_network(config.network, shape, options.size, network_key)
+        example = jax.tree.map(lambda leaf: leaf[0], no_decisions(environment, options, 1).transition)
+        learner = Learner(
+            network=network,
+            target=network,
+            adam=optax.scale_by_adam().init(network),
+            replay=empty_replay(example, capacity),
+        )
+        return Carry(learner, start_actors(environment, actor_key, config.environments), jnp.int32(0), key)
+
+    def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
+        collect_key, update_key, key = jax.random.split(carry.key, 3)
+        taken = number * config.decisions_per_round
+        epsilon = piecewise_linear(config.epsilon, taken)
+        learning_rate = piecewise_linear(config.learning_rate, taken)
+        learner = carry.learner
+
+        def choose(key: PRNGKeyArray, states: State) -> Int[Array, " N"]:
+            values = jax.vmap(option_values, in_axes=(None, None, 0))(learner.network, environment, states)
+            available = jax.vmap(options.initiation)(states)
+            keys = jax.random.split(key, config.environments)
+            return jax.vmap(epsilon_greedy, in_axes=(0, 0, 0, None))(keys, values, available, epsilon)
+
+        quota = config.decisions_per_round - carry.surplus
+        actors, decisions = collect(environment, options, rules, collect_key, carry.actors, choose, quota, slots)
+        surplus = jnp.sum(decisions.valid) - quota
+        learner = learner._replace(replay=add(learner.replay, decisions.transition, decisions.valid))
+
+        # These two numbers are the same for all seeds, so that under vmap the branch below stays a branch.
+        updates = jnp.where(number >= first_learning_round, config.updates_per_round, 0)
+        updates_before = (number - first_learning_round) * config.updates_per_round
+
+        def learn(index: Int[Array, ""], state: tuple) -> tuple:
+            network, target, adam, total = state
+            current = Learner(network, target, adam, learner.replay)
+            current, value = update(
+                config, environment, current, jax.random.fold_in(update_key, index), learning_rate
+            )
+            due = (updates_before + index + 1) % config.target_period == 0
+            target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
+            return current.network, target, current.adam, total + value
+
+        state = (learner.network, learner.target, learner.adam, jnp.float32(0))
+        network, target, adam, total = jax.lax.fori_loop(0, updates, learn, state)
+        learner = Learner(network, target, adam, learner.replay)
+        log = log_round(decisions, total / jnp.maximum(updates, 1).astype(jnp.float32))
+        return Carry(learner, actors, surplus, key), log
+
+    return Algorithm(init, run_round, config.decisions_per_round)

@@ -1,0 +1,83 @@
+"""Taking decisions in N environments of one seed until a quota is met."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from lodestone.envs.base import Environment, example_state
+from lodestone.options.base import Options
+from lodestone.options.execution import Actor, Decision, Rules, start_actor, tick
+from lodestone.types import State, Transition
+
+Choose = Callable[[PRNGKeyArray, State], Int[Array, " N"]]
+"""choose(key, states [N, ...]) -> an option for each environment; ignored where an option is still running."""
+
+
+def start_actors(environment: Environment, key: PRNGKeyArray, count: int) -> Actor:
+    """N actors, each at the beginning of an episode."""
+    return jax.vmap(start_actor, in_axes=(None, 0))(environment, jax.random.split(key, count))
+
+
+def tick_all(
+    environment: Environment, options: Options, rules: Rules, key: PRNGKeyArray, actors: Actor, choose: Choose
+) -> tuple[Actor, Decision]:
+    """One primitive step in each of N environments."""
+    choose_key, tick_key = jax.random.split(key)
+    choices = choose(choose_key, actors.state)
+    keys = jax.random.split(tick_key, choices.shape[0])
+    return jax.vmap(tick, in_axes=(None, None, None, 0, 0, 0))(environment, options, rules, keys, actors, choices)
+
+
+def collect(
+    environment: Environment,
+    options: Options,
+    rules: Rules,
+    key: PRNGKeyArray,
+    actors: Actor,
+    choose: Choose,
+    quota: Int[Array, ""],
+    capacity: int,
+) -> tuple[Actor, Decision]:
+    """Tick until `quota` decisions have ended; returns [capacity] decisions, the first ones valid.
+
+    Several options may end on the last tick, so `capacity` must be at least quota + N - 1. The decisions wait here,
+    outside the replay, because a vmapped loop copies everything it carries whenever one seed is done before another.
+    """
+
+    def unfinished(carry: tuple) -> Array:
+        return carry[3] < quota
+
+    def step(carry: tuple) -> tuple:
+        key, actors, waiting, count = carry
+        key, tick_key = jax.random.split(key)
+        actors, decisions = tick_all(environment, options, rules, tick_key, actors, choose)
+        rank = jnp.cumsum(decisions.valid.astype(jnp.int32)) + count
+        slot = jnp.where(decisions.valid, rank - 1, capacity)  # out of range: dropped
+        waiting = jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), waiting, decisions)
+        return key, actors, waiting, rank[-1]
+
+    waiting = no_decisions(environment, options, capacity)
+    _, actors, waiting, _ = jax.lax.while_loop(unfinished, step, (key, actors, waiting, jnp.int32(0)))
+    return actors, waiting
+
+
+def no_decisions(environment: Environment, options: Options, capacity: int) -> Decision:
+    """[capacity] decisions, none of them valid."""
+    state = example_state(environment)
+    zero, real = jnp.int32(0), jnp.float32(0)
+    available = jnp.zeros(options.size, dtype=bool)
+    example = Decision(
+        valid=jnp.bool_(False),
+        transition=Transition(state, zero, real, real, state, available),
+        steps=zero,
+        episode_ended=jnp.bool_(False),
+        terminated=jnp.bool_(False),
+        episode_return=real,
+        episode_steps=zero,
+        episode_decisions=zero,
+    )
+    return jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example)

@@ -1,0 +1,139 @@
+"""The training loop: compiled chunks of rounds, vectorised over seeds and spread over devices.
+
+A *round* is a fixed number of decisions followed by the learner's updates. What a round does is the algorithm's;
+the loop repeats it, collects what happened, and hands control back to Python between chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from lodestone.errors import Diverged, InvalidConfig
+from lodestone.options.execution import Decision
+
+
+class RoundLog(NamedTuple):
+    """What one round tells the host; M slots for decisions, the valid ones in order of time."""
+
+    valid: Bool[Array, " M"]
+    option: Int[Array, " M"]
+    steps: Int[Array, " M"]
+    episode_ended: Bool[Array, " M"]
+    terminated: Bool[Array, " M"]
+    episode_return: Float[Array, " M"]
+    episode_steps: Int[Array, " M"]
+    episode_decisions: Int[Array, " M"]
+    loss: Float[Array, ""]
+    """Mean loss of the round's updates; 0 before learning starts."""
+
+
+def log_round(decisions: Decision, loss: Float[Array, ""]) -> RoundLog:
+    """The part of a round's decisions that the host wants to know."""
+    return RoundLog(
+        valid=decisions.valid,
+        option=decisions.transition.action,
+        steps=decisions.steps,
+        episode_ended=decisions.episode_ended,
+        terminated=decisions.terminated,
+        episode_return=decisions.episode_return,
+        episode_steps=decisions.episode_steps,
+        episode_decisions=decisions.episode_decisions,
+        loss=loss,
+    )
+
+
+class Algorithm(NamedTuple):
+    """What the loop needs of a learner, for one seed."""
+
+    init: Callable[[PRNGKeyArray], Any]
+    """init(key) -> everything that the seed carries from round to round: learner, actors, key."""
+    run_round: Callable[[Any, Int[Array, ""]], tuple[Any, RoundLog]]
+    """run_round(carry, number of the round) -> (carry, log)."""
+    decisions_per_round: int
+
+
+class Chunk(NamedTuple):
+    """What some rounds brought, on the host: S seeds, R rounds, M slots."""
+
+    log: RoundLog
+    """NumPy leaves [S, R, M], the loss [S, R]."""
+    decisions: int
+    """Decisions per seed since the start of training."""
+    seconds: float
+    """Wall-clock time since the start of training, compilation included."""
+
+
+def train(
+    algorithm: Algorithm, seeds: Sequence[int], decisions: int, decisions_per_chunk: int = 1000
+) -> Iterator[tuple[Any, Chunk]]:
+    """Train all seeds at once for at least `decisions` decisions each; yields (carry, chunk) after every chunk.
+
+    The carry has a leading seed axis and is valid until the next chunk is asked for (its memory is then reused).
+    Seeds do not influence one another. Raises `Diverged` when a loss is no longer finite.
+    """
+    if not seeds:
+        raise InvalidConfig("Training needs at least one seed.")
+    if decisions < 1:
+        raise InvalidConfig(f"The number of decisions is {decisions}, but must be at least 1.")
+    rounds = -(-decisions // algorithm.decisions_per_round)
+    rounds_per_chunk = max(1, min(rounds, decisions_per_chunk // algorithm.decisions_per_round))
+
+    devices = jax.devices()[: len(seeds)]
+    padded = [*seeds, *seeds[: -len(seeds) % len(devices)]]  # every device gets equally many
+    mesh = Mesh(np.array(devices), ("seeds",))
+    over_seeds, everywhere = PartitionSpec("seeds"), PartitionSpec()
+    keys = jax.device_put(jnp.stack([jax.random.key(seed) for seed in padded]), NamedSharding(mesh, over_seeds))
+    spread = partial(jax.shard_map, mesh=mesh, check_vma=False)
+    init = jax.jit(spread(jax.vmap(algorithm.init), in_specs=over_seeds, out_specs=over_seeds))
+    run_chunk = jax.jit(
+        spread(
+            jax.vmap(partial(_run_chunk, algorithm, rounds_per_chunk), in_axes=(0, None, None)),
+            in_specs=(over_seeds, everywhere, everywhere),
+            out_specs=over_seeds,
+        ),
+        donate_argnums=0,
+    )
+
+    started = perf_counter()
+    carry = init(keys)
+    for first in range(0, rounds, rounds_per_chunk):
+        count = min(rounds_per_chunk, rounds - first)
+        carry, log = run_chunk(carry, jnp.int32(first), jnp.int32(count))
+        log = jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[: len(seeds), :count], log)
+        _require_finite(log.loss, seeds)
+        done = (first + count) * algorithm.decisions_per_round
+        yield carry, Chunk(log, done, perf_counter() - started)
+
+
+def _run_chunk(
+    algorithm: Algorithm, capacity: int, carry: Any, first: Int[Array, ""], count: Int[Array, ""]
+) -> tuple[Any, RoundLog]:
+    """`count` rounds of one seed, at most `capacity`. The count is dynamic, so that one compilation serves all chunks."""
+    _, shapes = jax.eval_shape(algorithm.run_round, carry, first)
+    empty = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), shapes)
+
+    def body(index: Int[Array, ""], state: tuple[Any, RoundLog]) -> tuple[Any, RoundLog]:
+        carry, logs = state
+        carry, log = algorithm.run_round(carry, first + index)
+        return carry, jax.tree.map(lambda all_, one: all_.at[index].set(one), logs, log)
+
+    return jax.lax.fori_loop(0, count, body, (carry, empty))
+
+
+def _require_finite(loss: Float[np.ndarray, "S R"], seeds: Sequence[int]) -> None:
+    bad = ~np.isfinite(loss).all(axis=1)
+    if bad.any():
+        seed = seeds[int(np.argmax(bad))]
+        raise Diverged(
+            f"The loss of seed {seed} is no longer a finite number; try a smaller learning rate, a smaller reward scale "
+            "or a smaller gradient norm."
+        )

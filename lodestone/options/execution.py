@@ -1,0 +1,187 @@
+"""Running options in lock-step primitive time.
+
+Every tick takes one primitive step in one environment. An option that ends on the tick yields one decision: the
+semi-Markov transition from where the option was chosen to where it ended. Environments never wait for one another's
+options. Written for one environment; the training loop vmaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from lodestone.envs.base import Environment, sample_categorical, sample_initial, sample_step
+from lodestone.errors import InvalidConfig
+from lodestone.options.base import Options
+from lodestone.types import State, Transition
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How time, reward and limits are counted."""
+
+    discount: float = 0.99
+    """gamma, per primitive step."""
+    step_limit: int | None = None
+    """Primitive steps after which an episode is truncated; None for never."""
+    decision_limit: int | None = None
+    """Decisions after which an episode is truncated; None for never."""
+    bootstrap_at_limit: bool = True
+    """Whether a truncated episode's last transition bootstraps. False treats a limit as an end, as the authors' code
+    does: a switch for reproduction only."""
+    undiscounted_option_reward: bool = False
+    """Whether an option's reward is the plain sum of its steps' rewards (the paper's "accumulated reward"): a switch for
+    reproduction only, as the values then depend on the options."""
+    call_cost: float = 0.0
+    """Taken from the reward of every option that may run longer than one step, once a call."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.discount <= 1.0:
+            raise InvalidConfig(f"discount is {self.discount}, but must be from 0 to 1.")
+        for name in ("step_limit", "decision_limit"):
+            limit = getattr(self, name)
+            if limit is not None and limit < 1:
+                raise InvalidConfig(f"{name} is {limit}, but must be at least 1.")
+
+
+class Actor(NamedTuple):
+    """What one environment's run remembers between ticks."""
+
+    state: State
+    deciding: Bool[Array, ""]
+    """Whether the next tick begins with a choice."""
+    start: State
+    """Where the running option was chosen."""
+    option: Int[Array, ""]
+    elapsed: Int[Array, ""]
+    """k, steps that the option has run."""
+    reward: Float[Array, ""]
+    """Reward of the option so far, discounted to its start."""
+    discount: Float[Array, ""]
+    """gamma^k."""
+    episode_return: Float[Array, ""]
+    """Undiscounted sum of the episode's primitive rewards."""
+    episode_steps: Int[Array, ""]
+    episode_decisions: Int[Array, ""]
+
+
+class Decision(NamedTuple):
+    """What a tick has to tell if an option ended on it."""
+
+    valid: Bool[Array, ""]
+    """Whether an option ended; nothing else here means anything where it did not."""
+    transition: Transition
+    """From the state of the choice to the state of the end."""
+    steps: Int[Array, ""]
+    """k, how long the option ran."""
+    episode_ended: Bool[Array, ""]
+    terminated: Bool[Array, ""]
+    """Whether the environment, not a limit, ended the episode."""
+    episode_return: Float[Array, ""]
+    episode_steps: Int[Array, ""]
+    episode_decisions: Int[Array, ""]
+
+
+def start_actor(environment: Environment, key: PRNGKeyArray) -> Actor:
+    """An actor at the beginning of its first episode."""
+    state = sample_initial(environment, key)
+    return Actor(
+        state=state,
+        deciding=jnp.bool_(True),
+        start=state,
+        option=jnp.int32(0),
+        elapsed=jnp.int32(0),
+        reward=jnp.float32(0),
+        discount=jnp.float32(1),
+        episode_return=jnp.float32(0),
+        episode_steps=jnp.int32(0),
+        episode_decisions=jnp.int32(0),
+    )
+
+
+def tick(
+    environment: Environment,
+    options: Options,
+    rules: Rules,
+    key: PRNGKeyArray,
+    actor: Actor,
+    choice: Int[Array, ""],
+) -> tuple[Actor, Decision]:
+    """One primitive step under the running option, or under `choice` where a new option begins.
+
+    The environment restarts by itself after an episode's end; `Decision.transition.next_obs` is the state before that.
+    """
+    action_key, outcome_key, termination_key, reset_key = jax.random.split(key, 4)
+    fresh = actor.deciding
+    option = jnp.where(fresh, choice, actor.option)
+    start = _select(fresh, actor.state, actor.start)
+    reward_before = jnp.where(fresh, 0.0, actor.reward)
+    discount_before = jnp.where(fresh, 1.0, actor.discount)
+
+    action = sample_categorical(action_key, options.action_probs(actor.state)[option])
+    state, reward, terminated = sample_step(environment, outcome_key, actor.state, action)
+
+    elapsed = jnp.where(fresh, 0, actor.elapsed) + 1
+    caps = jnp.asarray(options.max_steps, dtype=jnp.int32)
+    reward_weight = 1.0 if rules.undiscounted_option_reward else discount_before
+    call_cost = jnp.where(fresh & (caps[option] != 1), rules.call_cost, 0.0)
+    option_reward = reward_before + reward_weight * reward - call_cost
+    discount = discount_before * rules.discount
+    episode_steps = actor.episode_steps + 1
+    episode_decisions = actor.episode_decisions + fresh.astype(jnp.int32)
+
+    beta = options.termination(state)[option]
+    stops = (jax.random.uniform(termination_key) < beta) | (elapsed >= caps[option])
+    truncated = jnp.bool_(False)
+    if rules.step_limit is not None:
+        truncated |= episode_steps >= rules.step_limit
+    if rules.decision_limit is not None:
+        truncated |= stops & (episode_decisions >= rules.decision_limit)
+    truncated &= ~terminated
+    ended = stops | terminated | truncated
+
+    # Cut by a limit before its own end: the option would have gone on, so only its own value may be bootstrapped from.
+    cut = truncated & ~stops
+    available = jnp.where(cut, jnp.arange(options.size) == option, options.initiation(state))
+    no_future = terminated if rules.bootstrap_at_limit else terminated | truncated
+    episode_return = actor.episode_return + reward
+    decision = Decision(
+        valid=ended,
+        transition=Transition(
+            obs=start,
+            action=option,
+            reward=option_reward,
+            discount=jnp.where(no_future, 0.0, discount),
+            next_obs=state,
+            next_available=available,
+        ),
+        steps=elapsed,
+        episode_ended=terminated | truncated,
+        terminated=terminated,
+        episode_return=episode_return,
+        episode_steps=episode_steps,
+        episode_decisions=episode_decisions,
+    )
+
+    over = terminated | truncated
+    next_actor = Actor(
+        state=_select(over, sample_initial(environment, reset_key), state),
+        deciding=ended,
+        start=start,
+        option=option,
+        elapsed=elapsed,
+        reward=option_reward,
+        discount=discount,
+        episode_return=jnp.where(over, 0.0, episode_return),
+        episode_steps=jnp.where(over, 0, episode_steps),
+        episode_decisions=jnp.where(over, 0, episode_decisions),
+    )
+    return next_actor, decision
+
+
+def _select(condition: Bool[Array, ""], if_true: State, if_false: State) -> State:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
