@@ -21,9 +21,10 @@ from lodestone.errors import InvalidConfig
 from lodestone.learning.collecting import collect, no_decisions, start_actors
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
-from lodestone.learning.policies import epsilon_greedy, mask_unavailable
+from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.replay import Replay, add, empty_replay, sample
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
+from lodestone.learning.targets import double_semi_markov_target, semi_markov_target
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Rules
 from lodestone.types import State, Transition
@@ -61,6 +62,10 @@ class DQNConfig:
     """Updates after each round of decisions."""
     reward_scale: float = 1.0
     """Factor on rewards inside the learner; values near 10 are learned fastest."""
+
+    def rounds(self, decisions: int) -> int:
+        """How many rounds take at least `decisions` decisions."""
+        return -(-decisions // self.decisions_per_round)
 
     def __post_init__(self) -> None:
         check_knots("learning_rate", self.learning_rate, 0.0, 1.0)
@@ -103,23 +108,17 @@ class Carry(NamedTuple):
     key: PRNGKeyArray
 
 
-def bootstrap_values(
-    network: QNetwork, target: QNetwork, batch: Transition, double: bool
-) -> Float[Array, " B"]:
-    """max over the available options at `next_obs`, valued by the target network."""
-    values = jax.vmap(target)(batch.next_obs)
+def loss(network: QNetwork, target: QNetwork, batch: Transition, double: bool, reward_scale: float) -> Float[Array, ""]:
+    """Huber loss, summed over the batch, of Q(s, o) against the semi-Markov target."""
+    rewards = batch.reward * reward_scale
+    next_values = jax.vmap(target)(batch.next_obs)
     if double:
-        preferences = jax.vmap(mask_unavailable)(jax.vmap(network)(batch.next_obs), batch.next_available)
-        best = jnp.argmax(preferences, axis=1)
-        return jnp.take_along_axis(values, best[:, None], axis=1)[:, 0]
-    return jnp.max(jax.vmap(mask_unavailable)(values, batch.next_available), axis=1)
-
-
-def loss(
-    network: QNetwork, target: QNetwork, batch: Transition, double: bool, reward_scale: float
-) -> Float[Array, ""]:
-    """Huber loss, summed over the batch, of Q(s, o) against R + gamma^k (1 - terminated) max Q'(s', .)."""
-    targets = batch.reward * reward_scale + batch.discount * bootstrap_values(network, target, batch, double)
+        preferences = jax.vmap(network)(batch.next_obs)
+        targets = jax.vmap(double_semi_markov_target)(
+            rewards, batch.discount, next_values, preferences, batch.next_available
+        )
+    else:
+        targets = jax.vmap(semi_markov_target)(rewards, batch.discount, next_values, batch.next_available)
     values = jax.vmap(network)(batch.obs)
     chosen = jnp.take_along_axis(values, batch.action[:, None], axis=1)[:, 0]
     return jnp.sum(optax.huber_loss(chosen, jax.lax.stop_gradient(targets), delta=1.0))
@@ -199,9 +198,7 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
         def learn(index: Int[Array, ""], state: tuple) -> tuple:
             network, target, adam, total = state
             current = Learner(network, target, adam, learner.replay)
-            current, value = update(
-                config, environment, current, jax.random.fold_in(update_key, index), learning_rate
-            )
+            current, value = update(config, environment, current, jax.random.fold_in(update_key, index), learning_rate)
             due = (updates_before + index + 1) % config.target_period == 0
             target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
             return current.network, target, current.adam, total + value
@@ -212,4 +209,4 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
         log = log_round(decisions, total / jnp.maximum(updates, 1).astype(jnp.float32))
         return Carry(learner, actors, surplus, key), log
 
-    return Algorithm(init, run_round, config.decisions_per_round)
+    return Algorithm(init, run_round)

@@ -185,7 +185,7 @@ class MagnetArm(Environment):
             return reachable_states(self).index_of(state)
         if self.observation == "planes":
             codes = self.cell_codes(state)
-            return (codes[..., None] == jnp.arange(4, dtype=jnp.uint8)).astype(jnp.uint8)
+            return (codes[..., None] == jnp.arange(4, dtype=jnp.uint8)[None, None]).astype(jnp.uint8)
         return _picture(self, state)
 
     def render(self, state: ArmState) -> UInt8[np.ndarray, "height width 3"]:
@@ -220,17 +220,17 @@ def _picture_bytes(arm: MagnetArm, state: ArmState) -> UInt8[Array, " bytes"]:
     pixel_row, pixel_column, channel = np.unravel_index(np.arange(math.prod(shape)), shape)
     row, column = pixel_row // side, pixel_column // side
 
-    brick_here = jnp.zeros(len(row), dtype=state.bricks.dtype)
+    bricks = np.zeros(len(row), dtype=state.bricks.dtype)
     for each in range(arm.columns):
         bit = np.where(column == each, 1 << (arm.rows - 1 - row), 0)
-        brick_here |= state.bricks[each] & bit.astype(state.bricks.dtype)
+        bricks |= state.bricks[each] & bit.astype(state.bricks.dtype)
     arm_here = (row.astype(state.row.dtype) == state.row) & (column.astype(state.column.dtype) == state.column)
 
     # The arm's shape is an inverted T: the middle column of its cell and the bottom row.
     glyph = (pixel_column % side == side // 2) | (pixel_row % side == side - 1)
-    arm_on, arm_off = np.where(glyph, PALETTE[ARM_ON][channel], 0), np.where(glyph, PALETTE[ARM_OFF][channel], 0)
-    arm_colour = jnp.where(state.magnet, arm_on.astype(np.uint8), arm_off.astype(np.uint8))
-    return jnp.where(brick_here != 0, PALETTE[BRICK][channel], jnp.where(arm_here, arm_colour, jnp.uint8(0)))
+    empty, brick, arm_on, arm_off = PALETTE[:, channel]
+    arm_colour = lax.select(state.magnet, np.where(glyph, arm_on, empty), np.where(glyph, arm_off, empty))
+    return lax.select(bricks != 0, brick, lax.select(arm_here, arm_colour, empty))
 
 
 def _at_top(arm: MagnetArm, heights: Int[np.ndarray, "I columns"], column: Int[np.ndarray, " I"]) -> ArmState:
@@ -314,8 +314,3 @@ def go_down_task(arm: MagnetArm) -> Task:
 def lift_task(arm: MagnetArm) -> Task:
     """Go down, take a brick and lift it to the top: the training environment of the paper's second option."""
     return Task(arm, "lift", random_layouts, arm_has_lifted, _pay_for_lifting)
-
-
-def tasks(arm: MagnetArm) -> tuple[Task, ...]:
-    """The training tasks of the paper's two options."""
-    return go_down_task(arm), lift_task(arm)

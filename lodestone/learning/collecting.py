@@ -72,6 +72,7 @@ def no_decisions(environment: Environment, options: Options, capacity: int) -> D
     available = jnp.zeros(options.size, dtype=bool)
     example = Decision(
         valid=jnp.bool_(False),
+        action=zero,
         transition=Transition(state, zero, real, real, state, available),
         steps=zero,
         episode_ended=jnp.bool_(False),

@@ -58,7 +58,6 @@ class Algorithm(NamedTuple):
     """init(key) -> everything that the seed carries from round to round: learner, actors, key."""
     run_round: Callable[[Any, Int[Array, ""]], tuple[Any, RoundLog]]
     """run_round(carry, number of the round) -> (carry, log)."""
-    decisions_per_round: int
 
 
 class Chunk(NamedTuple):
@@ -66,26 +65,25 @@ class Chunk(NamedTuple):
 
     log: RoundLog
     """NumPy leaves [S, R, M], the loss [S, R]."""
-    decisions: int
-    """Decisions per seed since the start of training."""
+    rounds: int
+    """Rounds since the start of training."""
     seconds: float
     """Wall-clock time since the start of training, compilation included."""
 
 
 def train(
-    algorithm: Algorithm, seeds: Sequence[int], decisions: int, decisions_per_chunk: int = 1000
+    algorithm: Algorithm, seeds: Sequence[int], rounds: int, rounds_per_chunk: int
 ) -> Iterator[tuple[Any, Chunk]]:
-    """Train all seeds at once for at least `decisions` decisions each; yields (carry, chunk) after every chunk.
+    """Train all seeds at once for so many rounds each; yields (carry, chunk) after every chunk of rounds.
 
     The carry has a leading seed axis and is valid until the next chunk is asked for (its memory is then reused).
     Seeds do not influence one another. Raises `Diverged` when a loss is no longer finite.
     """
     if not seeds:
         raise InvalidConfig("Training needs at least one seed.")
-    if decisions < 1:
-        raise InvalidConfig(f"The number of decisions is {decisions}, but must be at least 1.")
-    rounds = -(-decisions // algorithm.decisions_per_round)
-    rounds_per_chunk = max(1, min(rounds, decisions_per_chunk // algorithm.decisions_per_round))
+    if rounds < 1:
+        raise InvalidConfig("Training needs at least one decision.")
+    rounds_per_chunk = min(rounds, rounds_per_chunk)
 
     devices = jax.devices()[: len(seeds)]
     padded = [*seeds, *seeds[: -len(seeds) % len(devices)]]  # every device gets equally many
@@ -110,8 +108,7 @@ def train(
         carry, log = run_chunk(carry, jnp.int32(first), jnp.int32(count))
         log = jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[: len(seeds), :count], log)
         _require_finite(log.loss, seeds)
-        done = (first + count) * algorithm.decisions_per_round
-        yield carry, Chunk(log, done, perf_counter() - started)
+        yield carry, Chunk(log, first + count, perf_counter() - started)
 
 
 def _run_chunk(

@@ -73,7 +73,9 @@ class Decision(NamedTuple):
     """What a tick has to tell if an option ended on it."""
 
     valid: Bool[Array, ""]
-    """Whether an option ended; nothing else here means anything where it did not."""
+    """Whether an option ended; where it did not, only `action` means anything."""
+    action: Int[Array, ""]
+    """The primitive action taken on this tick."""
     transition: Transition
     """From the state of the choice to the state of the end."""
     steps: Int[Array, ""]
@@ -151,6 +153,7 @@ def tick(
     episode_return = actor.episode_return + reward
     decision = Decision(
         valid=ended,
+        action=action,
         transition=Transition(
             obs=start,
             action=option,

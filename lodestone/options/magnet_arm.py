@@ -1,4 +1,7 @@
-"""The two options of Kuzmin and Panov (2018, section 4.2) for the magnet arm, written by hand."""
+"""The two options of Kuzmin and Panov (2018, section 4.2) for the magnet arm, written by hand.
+
+*go-down*: down to a brick or the floor. *lift*: down, take the brick, lift it to the top.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from lodestone.envs.magnet_arm import (
     arm_is_down,
     tower_heights,
 )
-from lodestone.options.scripted import Script, Scripted
+from lodestone.options.scripted import Script
 
 
 def _can_go_down(arm: MagnetArm, state: ArmState) -> Bool[Array, ""]:
@@ -55,8 +58,3 @@ def _lift(arm: MagnetArm, state: ArmState) -> Int[Array, ""]:
 
 GO_DOWN = Script("go-down", _can_go_down, _go_down, arm_is_down)
 LIFT = Script("lift", _can_lift, _lift, arm_has_lifted)
-
-
-def scripted_options(arm: MagnetArm) -> Scripted:
-    """*go-down*: down to a brick or the floor. *lift*: down, take the brick, lift it to the top."""
-    return Scripted(arm, (GO_DOWN, LIFT))

@@ -1,0 +1,232 @@
+"""Policies and option sets as files: arrays, and a recipe in JSON from which known kinds are built again.
+
+Nothing else is run on loading: a file from a stranger can at worst be refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from lodestone import __version__
+from lodestone.envs.base import Environment, example_state
+from lodestone.envs.registry import describe_environment, make_environment
+from lodestone.envs.state_space import reachable_states
+from lodestone.errors import BadFile, InvalidConfig, LodestoneError
+from lodestone.files import read_arrays, write_arrays
+from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
+from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.catalogue import scripted_options, task_named
+from lodestone.options.execution import Rules
+from lodestone.options.networks import NetworkOptions
+from lodestone.options.scripted import Scripted
+from lodestone.options.tabular import TabularOptions
+from lodestone.types import State
+
+Arrays = dict[str, np.ndarray]
+Recipe = dict[str, Any]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained policy over options, of one or more seeds."""
+
+    agent: str
+    """Name of the algorithm."""
+    environment: Environment
+    options: Options
+    rules: Rules
+    learned: QNetwork | Float[Array, "seeds S O"]
+    """A Q-network with a leading seed axis, or a table of option values per seed."""
+    reward_scale: float
+    """Factor by which the learned values are larger than the environment's rewards."""
+    seeds: tuple[int, ...]
+
+    def values(self, position: int) -> Callable[[State], Float[Array, " O"]]:
+        """Q(s, .) of the seed at this position, in units of the environment's reward."""
+        learned = jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.learned)
+        if isinstance(learned, QNetwork):
+            return lambda state: learned(self.environment.observe(state)) / self.reward_scale
+        space = reachable_states(self.environment)
+        return lambda state: learned[space.index_of(state)] / self.reward_scale
+
+
+def save_policy(path: Path, policy: Policy) -> None:
+    """Write one file. Raises `CannotWrite`."""
+    recipe, arrays = _describe_options(policy.options, "options")
+    network = _describe_network(policy.learned) if isinstance(policy.learned, QNetwork) else None
+    header = {
+        "kind": "policy",
+        "version": __version__,
+        "agent": policy.agent,
+        "environment": describe_environment(policy.environment),
+        "options": recipe,
+        "rules": asdict(policy.rules),
+        "network": network,
+        "reward_scale": policy.reward_scale,
+        "seeds": list(policy.seeds),
+    }
+    write_arrays(path, arrays | _named_arrays(policy.learned, "learned"), header)
+
+
+def load_policy(path: Path) -> Policy:
+    """Raises `BadFile`."""
+    arrays, header = _read(path, "policy")
+
+    def build() -> Policy:
+        environment = make_environment(header["environment"]["name"], **header["environment"]["parameters"])
+        options = _build_options(header["options"], arrays, "options", environment)
+        seeds = tuple(int(seed) for seed in header["seeds"])
+        if header["network"] is None:
+            shape = (len(seeds), reachable_states(environment).size, options.size)
+            template: PyTree = jax.ShapeDtypeStruct(shape, jnp.float32)
+        else:
+            template = _network_template(header["network"], environment, options.size, len(seeds))
+        learned = _fill(template, arrays, "learned")
+        rules = Rules(**header["rules"])
+        return Policy(header["agent"], environment, options, rules, learned, float(header["reward_scale"]), seeds)
+
+    return _refuse_bad(path, build)
+
+
+def save_options(path: Path, options: Options, environment: Environment) -> None:
+    """Write one file. Raises `CannotWrite`."""
+    recipe, arrays = _describe_options(options, "options")
+    header = {
+        "kind": "options",
+        "version": __version__,
+        "environment": describe_environment(environment),
+        "options": recipe,
+    }
+    write_arrays(path, arrays, header)
+
+
+def load_options(path: Path, environment: Environment) -> Options:
+    """Options for `environment`. Raises `BadFile`, also where they were made for observations of another shape."""
+    arrays, header = _read(path, "options")
+    return _refuse_bad(path, lambda: _build_options(header["options"], arrays, "options", environment))
+
+
+def _read(path: Path, kind: str) -> tuple[Arrays, Recipe]:
+    arrays, header = read_arrays(path)
+    if header.get("kind") != kind:
+        raise BadFile(f"{path} holds {header.get('kind', 'something else')}, but {kind} were expected.")
+    return arrays, header
+
+
+def _refuse_bad(path: Path, build: Callable[[], T]) -> T:
+    """`build()`, with whatever is wrong with a recipe turned into one sentence."""
+    try:
+        return build()
+    except BadFile as error:
+        raise BadFile(f"{path}: {error}") from None
+    except LodestoneError as error:
+        raise BadFile(f"{path} does not fit: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError):
+        raise BadFile(f"{path} is damaged, or from another version than {__version__}.") from None
+
+
+def _describe_options(options: Options, prefix: str) -> tuple[Recipe, Arrays]:
+    match options:
+        case Primitives():
+            return {"kind": "primitives"}, {}
+        case Scripted():
+            return {"kind": "scripted", "names": list(options.names)}, {}
+        case NetworkOptions():
+            recipe = {"kind": "networks", "names": list(options.names), "network": _describe_network(options.networks)}
+            return recipe, _named_arrays(options.networks, prefix)
+        case TabularOptions():
+            recipe = {"kind": "tabular", "names": list(options.names), "caps": list(options.caps)}
+            return recipe, _named_arrays({name: getattr(options, name) for name in TABLES}, prefix)
+        case Capped():
+            recipe, arrays = _describe_options(options.options, prefix)
+            return {"kind": "capped", "cap": options.cap, "options": recipe}, arrays
+        case Union():
+            parts = [_describe_options(part, f"{prefix}/{index}") for index, part in enumerate(options.parts)]
+            merged = {name: array for _, arrays in parts for name, array in arrays.items()}
+            return {"kind": "union", "parts": [recipe for recipe, _ in parts]}, merged
+    raise InvalidConfig(f"Options of the kind {type(options).__name__} cannot be saved.")
+
+
+TABLES = ("initiation_table", "policy_table", "termination_table")
+"""The arrays of tabular options."""
+
+
+def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Environment) -> Options:
+    match recipe["kind"]:
+        case "primitives":
+            return Primitives(environment.action_names)
+        case "scripted":
+            return scripted_options(environment, recipe["names"])
+        case "networks":
+            tasks = tuple(task_named(environment, name) for name in recipe["names"])
+            template = _network_template(recipe["network"], environment, environment.num_actions, len(tasks))
+            return NetworkOptions(tasks, _fill(template, arrays, prefix))
+        case "tabular":
+            space = reachable_states(environment)
+            names, caps = tuple(recipe["names"]), tuple(recipe["caps"])
+            shape = (space.size, len(names))
+            template = {
+                "initiation_table": jax.ShapeDtypeStruct(shape, bool),
+                "policy_table": jax.ShapeDtypeStruct((*shape, environment.num_actions), jnp.float32),
+                "termination_table": jax.ShapeDtypeStruct(shape, jnp.float32),
+            }
+            return TabularOptions(space, names, caps, **_fill(template, arrays, prefix))
+        case "capped":
+            return Capped(_build_options(recipe["options"], arrays, prefix, environment), int(recipe["cap"]))
+        case "union":
+            parts = enumerate(recipe["parts"])
+            return Union(tuple(_build_options(part, arrays, f"{prefix}/{index}", environment) for index, part in parts))
+    raise BadFile(f"options of an unknown kind, {recipe['kind']!r}")
+
+
+def _describe_network(network: QNetwork) -> Recipe:
+    """The shape of a network whose arrays have one leading axis."""
+    return asdict(
+        NetworkConfig(
+            kernels=tuple(layer.weight.shape[1] for layer in network.convolutions),
+            strides=tuple(layer.stride for layer in network.convolutions),
+            channels=tuple(layer.weight.shape[-1] for layer in network.convolutions),
+            hidden=tuple(layer.weight.shape[-1] for layer in network.layers[:-1]),
+        )
+    )
+
+
+def _network_template(recipe: Recipe, environment: Environment, outputs: int, count: int) -> QNetwork:
+    """Shapes and dtypes of `count` stacked networks for this environment's observations."""
+    config = NetworkConfig(**{name: tuple(int(number) for number in numbers) for name, numbers in recipe.items()})
+    observation = jax.eval_shape(environment.observe, example_state(environment))
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
+    return jax.eval_shape(jax.vmap(lambda key: init_q_network(config, observation.shape, outputs, key)), keys)
+
+
+def _named_arrays(tree: PyTree, prefix: str) -> Arrays:
+    """The arrays of a pytree by their paths."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {prefix + jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
+
+
+def _fill(template: PyTree, arrays: Arrays, prefix: str) -> PyTree:
+    """A pytree of the template's structure from named arrays. Raises `BadFile` where a shape or a type differs."""
+
+    def find(path: tuple, wanted: jax.ShapeDtypeStruct) -> Array:
+        name = prefix + jax.tree_util.keystr(path)
+        if name not in arrays:
+            raise BadFile(f"the array {name} is missing")
+        found = arrays[name]
+        if found.shape != wanted.shape or found.dtype != wanted.dtype:
+            raise BadFile(
+                f"{name} is {found.dtype} {list(found.shape)}, but this environment needs "
+                f"{wanted.dtype} {list(wanted.shape)}."
+            )
+        return jnp.asarray(found)
+
+    return jax.tree_util.tree_map_with_path(find, template)

@@ -1,0 +1,40 @@
+"""The environments by the names that the command line and Gymnasium know them by."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from lodestone.envs.base import Environment
+from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.errors import UnknownName, check_name
+
+ENVIRONMENTS: dict[str, type[Environment]] = {"magnet-arm": MagnetArm}
+"""Every environment, by name."""
+
+
+def environment_class(name: str) -> type[Environment]:
+    """The class of a name. Raises `UnknownName`."""
+    check_name("environment", name, tuple(ENVIRONMENTS))
+    return ENVIRONMENTS[name]
+
+
+def make_environment(name: str, **parameters: Any) -> Environment:
+    """The environment of a name, with its parameters.
+
+    Raises `UnknownName` for a name or a parameter that does not exist, and `InvalidConfig` for a bad value.
+    """
+    environment = environment_class(name)
+    known = tuple(field.name for field in dataclasses.fields(environment))
+    for parameter in parameters:
+        check_name(f"parameter of {name}", parameter, known)
+    return environment(**parameters)
+
+
+def describe_environment(environment: Environment) -> dict[str, Any]:
+    """Name and parameters, fit for JSON and for `make_environment`."""
+    for name, kind in ENVIRONMENTS.items():
+        if type(environment) is kind:
+            fields = dataclasses.fields(environment)
+            return {"name": name, "parameters": {field.name: getattr(environment, field.name) for field in fields}}
+    raise UnknownName(f"{type(environment).__name__} is not registered in ENVIRONMENTS, so it has no name to save.")

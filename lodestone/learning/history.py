@@ -1,0 +1,106 @@
+"""What happened while training, on the host: every finished episode of every seed, and which options were used."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lodestone.learning.loop import Chunk
+
+
+class Episodes(NamedTuple):
+    """All finished episodes of one seed, in order; arrays of length E."""
+
+    decisions: Int[np.ndarray, " E"]
+    """Decisions taken by the seed when the episode ended."""
+    steps: Int[np.ndarray, " E"]
+    """Primitive steps taken by then."""
+    total_reward: Float[np.ndarray, " E"]
+    length_steps: Int[np.ndarray, " E"]
+    length_decisions: Int[np.ndarray, " E"]
+    success: np.ndarray
+    """Whether the environment ended the episode, rather than a limit."""
+
+
+class Usage(NamedTuple):
+    """What one chunk used, per seed and option."""
+
+    decisions: Int[np.ndarray, " S"]
+    """Decisions of each seed since the start of training, at the chunk's end."""
+    calls: Int[np.ndarray, "S O"]
+    steps: Int[np.ndarray, "S O"]
+    """Primitive steps under each option."""
+    loss: Float[np.ndarray, " S"]
+    """Mean loss."""
+    seconds: float
+
+
+class History:
+    """Grows chunk by chunk."""
+
+    def __init__(self, seeds: int, options: int) -> None:
+        self._episodes: list[list[np.ndarray]] = [[] for _ in range(seeds)]
+        self._taken = np.zeros((seeds, 2), dtype=np.int64)  # decisions, steps
+        self._options = options
+        self.usage: list[Usage] = []
+
+    def add(self, chunk: Chunk) -> None:
+        """Append what a chunk brought."""
+        log = chunk.log
+        seeds = log.valid.shape[0]
+        calls = np.zeros((seeds, self._options), dtype=np.int64)
+        steps = np.zeros((seeds, self._options), dtype=np.int64)
+        for seed in range(seeds):
+            valid = log.valid[seed].ravel()
+
+            def flat(leaf: np.ndarray, seed: int = seed, valid: np.ndarray = valid) -> np.ndarray:
+                return leaf[seed].ravel()[valid]
+
+            option, length, ended = flat(log.option), flat(log.steps), flat(log.episode_ended)
+            calls[seed] = np.bincount(option, minlength=self._options)
+            steps[seed] = np.bincount(option, weights=length, minlength=self._options)
+            decisions_so_far = self._taken[seed, 0] + 1 + np.arange(len(option))
+            steps_so_far = self._taken[seed, 1] + np.cumsum(length)
+            columns = (
+                decisions_so_far,
+                steps_so_far,
+                flat(log.episode_return),
+                flat(log.episode_steps),
+                flat(log.episode_decisions),
+                flat(log.terminated),
+            )
+            self._episodes[seed].append(np.stack([column[ended].astype(np.float64) for column in columns]))
+            self._taken[seed] += (len(option), int(length.sum()))
+        self.usage.append(Usage(self._taken[:, 0].copy(), calls, steps, log.loss.mean(axis=1), chunk.seconds))
+
+    def episodes(self, seed: int) -> Episodes:
+        """The finished episodes of the seed with this position."""
+        rows = np.concatenate(self._episodes[seed], axis=1) if self._episodes[seed] else np.zeros((6, 0))
+        whole = rows.astype(np.int64)
+        return Episodes(whole[0], whole[1], rows[2], whole[3], whole[4], rows[5] > 0)
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock time of the run so far."""
+        return self.usage[-1].seconds if self.usage else 0.0
+
+    def taken(self, seed: int) -> tuple[int, int]:
+        """(decisions, primitive steps) of one seed."""
+        return int(self._taken[seed, 0]), int(self._taken[seed, 1])
+
+
+def running_mean(values: Float[np.ndarray, " E"], window: int) -> Float[np.ndarray, " E"]:
+    """Mean of the last `window` values; not a number before there are so many."""
+    means = np.full(len(values), np.nan)
+    if len(values) >= window:
+        sums = np.cumsum(np.insert(values, 0, 0.0))
+        means[window - 1 :] = (sums[window:] - sums[:-window]) / window
+    return means
+
+
+def first_above(episodes: Episodes, threshold: float, window: int = 50) -> int | None:
+    """Position of the first episode at which the mean return of the last `window` episodes exceeds `threshold`."""
+    above = running_mean(episodes.total_reward, window) > threshold
+    return int(np.argmax(above)) if above.any() else None

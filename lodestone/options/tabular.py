@@ -1,0 +1,53 @@
+"""Options as arrays over numbered states: the fastest kind, and the exact image of any other on an enumerable world."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lodestone.envs.state_space import StateSpace
+from lodestone.options.base import Options
+from lodestone.planning.option_models import tabulate_options
+from lodestone.types import State
+
+
+class TabularOptions(Options):
+    """O options over S states."""
+
+    space: StateSpace
+    option_names: tuple[str, ...] = eqx.field(static=True)
+    caps: tuple[int, ...] = eqx.field(static=True)
+    initiation_table: Bool[Array, "S O"]
+    policy_table: Float[Array, "S O A"]
+    termination_table: Float[Array, "S O"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.option_names
+
+    @property
+    def max_steps(self) -> tuple[int, ...]:
+        return self.caps
+
+    def initiation(self, state: State) -> Bool[Array, " O"]:
+        return self.initiation_table[self.space.index_of(state)]
+
+    def action_probs(self, state: State) -> Float[Array, "O A"]:
+        return self.policy_table[self.space.index_of(state)]
+
+    def termination(self, state: State) -> Float[Array, " O"]:
+        return self.termination_table[self.space.index_of(state)]
+
+
+def as_tabular(options: Options, space: StateSpace) -> TabularOptions:
+    """The same options as tables over `space`: equal in every state of it, and as cheap as a look-up."""
+    tables = tabulate_options(options, space)
+    return TabularOptions(
+        space,
+        tables.names,
+        tables.max_steps,
+        initiation_table=jnp.asarray(tables.initiation.T),
+        policy_table=jnp.asarray(tables.action_probs.swapaxes(0, 1)),
+        termination_table=jnp.asarray(tables.termination.T),
+    )

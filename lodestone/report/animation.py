@@ -1,0 +1,98 @@
+"""An episode as an animated picture."""
+
+from __future__ import annotations
+
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from lodestone.experiments.comparison import Playback
+from lodestone.report.files import replace_file
+from lodestone.report.palette import GRID, INK, MUTED, option_colours, text_on
+
+MIN_WIDTH = 360
+"""Pixels; smaller pictures are enlarged by a whole factor."""
+STRIP = 62
+"""Height of the strip under the picture, in pixels."""
+STEP_MS, END_MS = 600, 3000
+
+
+@cache
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu, which every installation of matplotlib brings."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(Path(mpl.get_data_path()) / "fonts" / "ttf" / name, size)
+
+
+def write_gif(playback: Playback, path: str | Path) -> None:
+    """Write the episode as a GIF of T+1 frames: before each step, with what is done there, and the end.
+
+    Raises `CannotWrite`.
+    """
+    frames = [_frame(playback, step) for step in range(len(playback.pictures))]
+    # One palette for all frames: colours stay still, and frames differ only where something moved.
+    colours = _montage(frames).quantize(255)
+    frames = [frame.quantize(palette=colours, dither=Image.Dither.NONE) for frame in frames]
+    content = BytesIO()
+    frames[0].save(
+        content,
+        format="GIF",
+        save_all=True,
+        append_images=frames[1:],
+        duration=[STEP_MS] * (len(frames) - 1) + [END_MS],
+        loop=0,
+        optimize=True,
+    )
+    replace_file(path, content.getvalue())
+
+
+def _montage(frames: list[Image.Image]) -> Image.Image:
+    """Some of the frames in one picture, to choose colours from."""
+    some = frames[:: max(len(frames) // 8, 1)]
+    return Image.fromarray(np.concatenate([np.asarray(frame) for frame in some]))
+
+
+def _frame(playback: Playback, step: int) -> Image.Image:
+    picture = Image.fromarray(playback.pictures[step])
+    scale = -(-MIN_WIDTH // picture.width)
+    picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
+    frame = Image.new("RGB", (picture.width, picture.height + STRIP), "white")
+    frame.paste(picture)
+    draw = ImageDraw.Draw(frame)
+    top, left, right = picture.height, 12, picture.width - 12
+    draw.line((0, top, frame.width, top), GRID)
+
+    total = len(playback.option)
+    total_reward = playback.total_reward[step - 1] if step else 0.0
+    reward_text = f"return {total_reward:g}"
+    draw.text((right, top + 20), reward_text, INK, _font(13), anchor="rm")
+    if step == total:
+        draw.text((left, top + 20), "end of the episode", INK, _font(14, bold=True), anchor="lm")
+        draw.text((left, top + 46), f"{total} steps, {playback.chosen.sum()} decisions", MUTED, _font(12), anchor="lm")
+        return frame
+    option, action = playback.option[step], playback.action[step]
+    colour = option_colours(playback.option_names, playback.action_names)[option]
+    room = right - 24 - draw.textlength(reward_text, _font(13)) - left
+    name = _shortened(playback.option_names[option], _font(14, bold=True), room)
+    label = (left, top + 8, left + 16 + draw.textlength(name, _font(14, bold=True)), top + 32)
+    draw.rounded_rectangle(label, 6, colour)
+    draw.text((left + 8, top + 20), name, text_on(colour), _font(14, bold=True), anchor="lm")
+    chosen_at = np.flatnonzero(playback.chosen[: step + 1])[-1]
+    since = "▶ chosen now" if chosen_at == step else f"since step {chosen_at + 1}"
+    doing = _shortened(f"{since} · {playback.action_names[action]}", _font(12), right - left - 90)
+    draw.text((left, top + 46), doing, INK if chosen_at == step else MUTED, _font(12), anchor="lm")
+    draw.text((right, top + 46), f"step {step + 1} of {total}", MUTED, _font(12), anchor="rm")
+    return frame
+
+
+def _shortened(text: str, font: ImageFont.FreeTypeFont, width: float) -> str:
+    """The text, or as much of it as fits."""
+    if font.getlength(text) <= width:
+        return text
+    while text and font.getlength(text + "…") > width:
+        text = text[:-1]
+    return text + "…"
