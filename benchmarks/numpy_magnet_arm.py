@@ -17,7 +17,7 @@ MOVES = {LEFT: (0, -1), UP: (-1, 0), RIGHT: (0, 1), DOWN: (1, 0)}
 
 
 def tiles(pixels: int) -> np.ndarray:
-    """The pictures of an empty cell, a brick, the arm with its magnet on, and with its magnet off: uint8 [4, p, p, 3]."""
+    """Pictures of an empty cell, a brick, the arm with the magnet on, and with the magnet off: uint8 [4, p, p, 3]."""
     pictures = np.zeros((4, pixels, pixels, 3), dtype=np.uint8)
     pictures[1] = 230, 200, 150
     for code, colour in ((2, (51, 153, 255)), (3, (204, 0, 0))):

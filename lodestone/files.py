@@ -6,9 +6,10 @@ Arrays travel as safetensors with one JSON object in the header; there is no pic
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,28 +34,50 @@ def prepare_folder(path: Path) -> Path:
     return path
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """The file appears whole or not at all. Raises `CannotWrite`."""
-    write_file_atomically(path, lambda temporary: temporary.write_bytes(content))
-
-
-def write_file_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call `write(temporary path)`, then move what it wrote to `path`. Raises `CannotWrite`."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix}")
+def write_atomically(path: str | Path, content: bytes) -> None:
+    """The file appears whole or not at all; missing folders are made. Raises `CannotWrite`."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        write(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise CannotWrite(f"{path} cannot be written: {error.strerror or error}.") from None
-    finally:
-        temporary.unlink(missing_ok=True)
+        raise CannotWrite(f"Cannot write {path}: {error.strerror or error}.") from None
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Indented JSON; numbers that JSON lacks (NaN, infinities) are refused."""
-    write_atomically(path, (json.dumps(content, indent=2, allow_nan=False) + "\n").encode())
+def json_safe(value: object) -> Any:
+    """The same in JSON's types: data classes and named tuples as objects, arrays as lists, not-finite numbers as None,
+    anything else as its text."""
+    match value:
+        case None | bool() | int() | str():
+            return value
+        case np.generic() | np.ndarray():
+            return json_safe(value.tolist())
+        case float():
+            return value if math.isfinite(value) else None
+        case Mapping():
+            return {str(key): json_safe(each) for key, each in value.items()}
+        case tuple() if hasattr(value, "_asdict"):
+            return json_safe(value._asdict())
+        case list() | tuple():
+            return [json_safe(each) for each in value]
+        case _ if hasattr(value, "__dataclass_fields__"):
+            return {name: json_safe(getattr(value, name)) for name in value.__dataclass_fields__}
+        case _:
+            return str(value)
+
+
+def write_json(path: str | Path, content: object) -> None:
+    """Indented JSON of `json_safe(content)`. Raises `CannotWrite`."""
+    text = json.dumps(json_safe(content), indent=2, ensure_ascii=False, allow_nan=False)
+    write_atomically(path, f"{text}\n".encode())
 
 
 def read_json(path: Path) -> Any:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
 from lodestone.envs.base import Environment, example_state
 from lodestone.errors import InvalidConfig
@@ -38,8 +38,8 @@ class DQNConfig:
     """Shape of the Q-network."""
     double: bool = True
     """Whether the online network picks the option that the target network values (double Q-learning)."""
-    learning_rate: Knots = ((0, 1e-3),)
-    """Adam's step size over the decisions."""
+    learning_rate: Knots = ((0.0, 1e-3), (0.6, 1e-3), (1.0, 1e-4))
+    """Adam's step size over the run."""
     adam_epsilon: float = 1e-4
     """Adam's constant under the fraction."""
     max_gradient_norm: float = 10.0
@@ -52,8 +52,8 @@ class DQNConfig:
     """Decisions before the first update."""
     target_period: int = 200
     """Updates between two copies of the network to the target network."""
-    epsilon: Knots = ((0, 1.0), (10_000, 0.05))
-    """Probability of a random option over the decisions."""
+    epsilon: Knots = ((0.0, 1.0), (0.2, 0.2), (0.8, 0.02))
+    """Probability of a random option over the run."""
     environments: int = 8
     """Copies of the environment that one seed runs side by side."""
     decisions_per_round: int = 8
@@ -128,11 +128,14 @@ def update(
     config: DQNConfig,
     environment: Environment,
     learner: Learner,
-    key: PRNGKeyArray,
+    bits: UInt32[Array, " B"],
     learning_rate: Float[Array, ""],
 ) -> tuple[Learner, Float[Array, ""]]:
-    """One gradient step on one batch; the target network stays. Returns the mean loss per transition, too."""
-    batch = sample(learner.replay, key, config.batch_size)
+    """One gradient step on one batch, drawn by random bits; the target network stays.
+
+    Returns the mean loss per transition, too.
+    """
+    batch = sample(learner.replay, bits)
     observe = jax.vmap(environment.observe)
     batch = batch._replace(obs=observe(batch.obs), next_obs=observe(batch.next_obs))
     value, gradient = jax.value_and_grad(loss)(
@@ -155,7 +158,10 @@ def option_values(network: QNetwork, environment: Environment, state: State) -> 
 
 
 def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Rules, decisions: int) -> Algorithm:
-    """The algorithm for the training loop. `decisions` bounds the run's length, and so the replay's memory."""
+    """The algorithm for the training loop.
+
+    `decisions`, the run's length, is what schedules are fractions of; it bounds the replay's memory, too.
+    """
     slots = config.decisions_per_round + config.environments - 1
     capacity = max(slots, min(config.replay_capacity, decisions + slots))
     first_learning_round = config.learning_starts // config.decisions_per_round
@@ -175,30 +181,31 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         collect_key, update_key, key = jax.random.split(carry.key, 3)
-        taken = number * config.decisions_per_round
-        epsilon = piecewise_linear(config.epsilon, taken)
-        learning_rate = piecewise_linear(config.learning_rate, taken)
+        fraction = number.astype(jnp.float32) * (config.decisions_per_round / decisions)
+        epsilon = piecewise_linear(config.epsilon, fraction)
+        learning_rate = piecewise_linear(config.learning_rate, fraction)
         learner = carry.learner
 
-        def choose(key: PRNGKeyArray, states: State) -> Int[Array, " N"]:
+        def choose(uniform: Float[Array, "N 2"], states: State) -> Int[Array, " N"]:
             values = jax.vmap(option_values, in_axes=(None, None, 0))(learner.network, environment, states)
             available = jax.vmap(options.initiation)(states)
-            keys = jax.random.split(key, config.environments)
-            return jax.vmap(epsilon_greedy, in_axes=(0, 0, 0, None))(keys, values, available, epsilon)
+            return jax.vmap(epsilon_greedy, in_axes=(0, 0, 0, None))(uniform, values, available, epsilon)
 
         quota = config.decisions_per_round - carry.surplus
-        actors, decisions = collect(environment, options, rules, collect_key, carry.actors, choose, quota, slots)
-        surplus = jnp.sum(decisions.valid) - quota
-        learner = learner._replace(replay=add(learner.replay, decisions.transition, decisions.valid))
+        actors, taken = collect(environment, options, rules, collect_key, carry.actors, choose, quota, slots)
+        surplus = jnp.sum(taken.valid) - quota
+        learner = learner._replace(replay=add(learner.replay, taken.transition, taken.valid))
 
         # These two numbers are the same for all seeds, so that under vmap the branch below stays a branch.
         updates = jnp.where(number >= first_learning_round, config.updates_per_round, 0)
         updates_before = (number - first_learning_round) * config.updates_per_round
 
+        bits = jax.random.bits(update_key, (config.updates_per_round, config.batch_size))
+
         def learn(index: Int[Array, ""], state: tuple) -> tuple:
             network, target, adam, total = state
             current = Learner(network, target, adam, learner.replay)
-            current, value = update(config, environment, current, jax.random.fold_in(update_key, index), learning_rate)
+            current, value = update(config, environment, current, bits[index], learning_rate)
             due = (updates_before + index + 1) % config.target_period == 0
             target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
             return current.network, target, current.adam, total + value
@@ -206,7 +213,7 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
         state = (learner.network, learner.target, learner.adam, jnp.float32(0))
         network, target, adam, total = jax.lax.fori_loop(0, updates, learn, state)
         learner = Learner(network, target, adam, learner.replay)
-        log = log_round(decisions, total / jnp.maximum(updates, 1).astype(jnp.float32))
+        log = log_round(taken, total / jnp.maximum(updates, 1).astype(jnp.float32))
         return Carry(learner, actors, surplus, key), log
 
     return Algorithm(init, run_round)

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.envs.task import Task
@@ -20,7 +20,6 @@ from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.planning.solve import optimum
 from lodestone.types import State
-
 
 JUDGE_EVERY = 1000
 """Decisions between two judgements."""

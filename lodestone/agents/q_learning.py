@@ -1,4 +1,4 @@
-"""Tabular Q-learning on options (Kuzmin and Panov 2018, algorithm 1; macro Q-learning of Sutton, Precup and Singh 1999).
+"""Tabular Q-learning on options (Kuzmin and Panov 2018, algorithm 1; Sutton, Precup and Singh 1999).
 
     Q(s, o) <- Q(s, o) + alpha [ R + gamma^k max over available o' of Q(s', o') - Q(s, o) ]
 
@@ -15,8 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.envs.base import Environment
-from lodestone.envs.state_space import StateSpace
-from lodestone.errors import InvalidConfig
+from lodestone.envs.state_space import StateSpace, reachable_states
 from lodestone.learning.collecting import start_actors, tick_all
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import epsilon_greedy
@@ -31,10 +30,10 @@ from lodestone.types import State
 class QLearningConfig:
     """Settings of the learner."""
 
-    learning_rate: Knots = ((0, 0.5),)
-    """alpha over the decisions."""
-    epsilon: Knots = ((0, 1.0), (100_000, 0.05))
-    """Probability of a random option over the decisions."""
+    learning_rate: Knots = ((0.0, 0.5),)
+    """alpha over the run."""
+    epsilon: Knots = ((0.0, 1.0), (0.7, 0.05))
+    """Probability of a random option over the run."""
 
     def __post_init__(self) -> None:
         check_knots("learning_rate", self.learning_rate, 0.0, 1.0)
@@ -48,7 +47,6 @@ class Carry(NamedTuple):
     """Q; starts at zero as in the paper, which is optimistic where steps cost."""
     actors: Actor
     """One actor, with a leading axis of one."""
-    decisions: Int[Array, ""]
     key: PRNGKeyArray
 
 
@@ -64,30 +62,33 @@ def update(
 
 
 def q_learning(
-    config: QLearningConfig, environment: Environment, options: Options, rules: Rules, space: StateSpace
+    config: QLearningConfig, environment: Environment, options: Options, rules: Rules, steps: int
 ) -> Algorithm:
-    """The algorithm for the training loop. A round is one primitive step."""
+    """The algorithm for the training loop. A round is one primitive step; schedules are fractions of `steps`.
+
+    Raises `TooManyStates` where the table would be too large.
+    """
+    space = reachable_states(environment)
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
         table = jnp.zeros((space.size, options.size))
-        return Carry(table, start_actors(environment, actor_key, 1), jnp.int32(0), key)
+        return Carry(table, start_actors(environment, actor_key, 1), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
-        del number
+        fraction = number.astype(jnp.float32) / steps
         tick_key, key = jax.random.split(carry.key)
-        epsilon = piecewise_linear(config.epsilon, carry.decisions)
+        epsilon = piecewise_linear(config.epsilon, fraction)
 
-        def choose(key: PRNGKeyArray, states: State) -> Int[Array, " 1"]:
+        def choose(uniform: Float[Array, "1 2"], states: State) -> Int[Array, " 1"]:
             state = jax.tree.map(lambda leaf: leaf[0], states)
             values = carry.table[space.index_of(state)]
-            return epsilon_greedy(key, values, options.initiation(state), epsilon)[None]
+            return epsilon_greedy(uniform[0], values, options.initiation(state), epsilon)[None]
 
         actors, decisions = tick_all(environment, options, rules, tick_key, carry.actors, choose)
         decision = jax.tree.map(lambda leaf: leaf[0], decisions)
-        learning_rate = piecewise_linear(config.learning_rate, carry.decisions)
+        learning_rate = piecewise_linear(config.learning_rate, fraction)
         table, loss = update(carry.table, space, decision, learning_rate)
-        taken = carry.decisions + decision.valid.astype(jnp.int32)
-        return Carry(table, actors, taken, key), log_round(decisions, loss)
+        return Carry(table, actors, key), log_round(decisions, loss)
 
     return Algorithm(init, run_round)

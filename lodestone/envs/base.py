@@ -75,14 +75,18 @@ class Step(NamedTuple):
     terminated: Bool[Array, ""]
 
 
-def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Array, ""]:
-    """An index drawn with the given probabilities; one of probability zero is never drawn.
+def inverse_cdf(probs: Float[Array, " K"], uniform: Float[Array, ""]) -> Int[Array, ""]:
+    """The index that a uniform number in [0, 1) picks; one of probability zero is never picked.
 
-    Inverse of the cumulative sum: one uniform number a draw, where a Gumbel draw would take K.
+    One number a draw, where a Gumbel draw would take K.
     """
     edges = jnp.cumsum(probs)
-    threshold = jax.random.uniform(key) * edges[-1]
-    return jnp.sum(threshold >= edges[:-1]).astype(jnp.int32)
+    return jnp.sum(uniform * edges[-1] >= edges[:-1]).astype(jnp.int32)
+
+
+def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Array, ""]:
+    """An index drawn with the given probabilities."""
+    return inverse_cdf(probs, jax.random.uniform(key))
 
 
 def sample_initial(environment: Environment, key: PRNGKeyArray) -> State:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -32,8 +32,8 @@ from lodestone.envs.state_space import reachable_states
 from lodestone.errors import InvalidConfig
 from lodestone.types import Observation, State
 
-RENDER_FPS = 8
-"""Frames a second at which a person can follow."""
+METADATA = {"render_modes": ["rgb_array"], "render_fps": 8}
+"""A person can follow eight frames a second."""
 
 
 class Chance(NamedTuple):
@@ -42,8 +42,8 @@ class Chance(NamedTuple):
     A counter and not a key that is split at every step: where a world is deterministic, XLA leaves the hashing out.
     """
 
-    seed: UInt32[Array, ""]
-    drawn: UInt32[Array, ""]
+    seed: UInt32[Array | np.ndarray, ""]
+    drawn: UInt32[Array | np.ndarray, ""]
 
     def key(self) -> PRNGKeyArray:
         return jax.random.fold_in(jax.random.key(self.seed), self.drawn)
@@ -166,7 +166,7 @@ def observation_space(environment: Environment) -> spaces.Space:
         return spaces.Discrete(reachable_states(environment).size)
     if np.issubdtype(dtype, np.floating):
         return spaces.Box(-np.inf, np.inf, shape, dtype)
-    if dtype == bool:
+    if np.issubdtype(dtype, np.bool_):
         return spaces.Box(0, 1, shape, np.int8)
     return spaces.Box(np.iinfo(dtype).min, np.iinfo(dtype).max, shape, dtype)
 
@@ -187,17 +187,16 @@ def _check_render_mode(render_mode: str | None) -> None:
 
 def _chance(generator: np.random.Generator) -> Chance:
     """A stream of its own for one copy."""
-    return Chance(generator.integers(2**32, dtype=np.uint32), np.uint32(0))
+    return Chance(generator.integers(2**32, size=(), dtype=np.uint32), np.zeros((), dtype=np.uint32))
 
 
 class GymnasiumEnv(gymnasium.Env[np.ndarray, np.int64]):
     """One copy of an environment."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": RENDER_FPS}
-
     def __init__(self, environment: Environment, step_limit: int | None = None, render_mode: str | None = None) -> None:
         """`step_limit`: steps after which an episode is truncated. Raises `InvalidConfig`."""
         _check_render_mode(render_mode)
+        self.metadata = dict(METADATA)
         self.environment = environment
         self.step_limit = step_limit
         self.render_mode = render_mode
@@ -209,8 +208,10 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.int64]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begin an episode; with a seed, the first of a reproducible sequence of episodes."""
         super().reset(seed=seed)
-        goes_on = seed is None and self._running is not None
-        chance = self._running.chance if goes_on else _chance(self.np_random)
+        if seed is not None or self._running is None:
+            chance = _chance(self.np_random)
+        else:
+            chance = self._running.chance
         self._running, observation = _begin_one(self.environment, chance)
         return self._to_host(observation), {"success": False}
 
@@ -264,7 +265,7 @@ class GymnasiumVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         except ValueError:
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise InvalidConfig(f"autoreset_mode is {autoreset_mode!r}, but must be one of {known}.") from None
-        self.metadata = {**GymnasiumEnv.metadata, "autoreset_mode": self._mode}
+        self.metadata = {**METADATA, "autoreset_mode": self._mode}
         self.environment = environment
         self.num_envs = num_envs
         self.step_limit = step_limit

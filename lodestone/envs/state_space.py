@@ -175,7 +175,9 @@ class _Known:
 def _distinct(states: State, hashes_of: Callable[[State], np.ndarray]) -> tuple[State, np.ndarray]:
     """The different ones among `states`, in order of first appearance, and their hashes."""
     count = _length(states)
-    hashes = np.concatenate([np.zeros(0, np.uint64), *(hashes_of(padded) for padded in _padded_batches(states))])[:count]
+    hashes = np.concatenate([np.zeros(0, np.uint64), *(hashes_of(padded) for padded in _padded_batches(states))])[
+        :count
+    ]
     _, first, back = np.unique(hashes, return_index=True, return_inverse=True)
     _require_equal(states, _take(states, first[back]))
     keep = np.sort(first)

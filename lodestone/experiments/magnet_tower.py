@@ -18,34 +18,28 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from lodestone.agents.dqn import DQNConfig, dqn
+from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.playing import play, record
 from lodestone.agents.pretraining import Judgement, Pretrained, as_options, pretrain
 from lodestone.agents.saved import Policy
+from lodestone.agents.training import train_policy
 from lodestone.envs.magnet_arm import MagnetArm
-from lodestone.envs.state_space import reachable_states
 from lodestone.errors import check_name
 from lodestone.experiments.comparison import AgentRun, Comparison, Gate, GreedyResult, OptionRun, at_least, at_most
 from lodestone.learning.history import History, first_above
-from lodestone.learning.loop import train
 from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.progress import Progress
 from lodestone.options.base import Capped, Options, Primitives, Union
 from lodestone.options.catalogue import task_named
 from lodestone.options.execution import Rules
-from lodestone.options.tabular import as_tabular
 from lodestone.planning.option_models import fewest_decisions, tabulate_options
 from lodestone.planning.solve import optimum
 from lodestone.planning.tables import tabulate
 
 OPTION_CAP = 21
 """Steps after which an option is stopped: the authors test their limit of 20 after the step."""
-
-DECISIONS_PER_CHUNK = 1000
-"""Decisions between two reports of progress."""
 
 THRESHOLDS = (0.0, 50.0, 70.0, 80.0, 85.0)
 """Mean returns of 50 episodes whose first crossing is reported."""
@@ -103,57 +97,43 @@ def _fast(figure: str) -> tuple[dict[str, Training], dict[str, Training]]:
     network = NetworkConfig(kernels=(3,), strides=(3,), channels=(32,), hidden=(128,))
     base = DQNConfig(network=network, reward_scale=0.1)
     if figure == "2":
-        pretraining = replace(base, learning_rate=((0, 1e-3), (10_000, 2e-4)), epsilon=((0, 1.0), (4_000, 0.1)))
-        steps = {"go-down": 10_000, "lift": 20_000}
-        agent = replace(base, learning_rate=((0, 1e-3), (12_000, 1e-3), (25_000, 1e-4)))
-        decisions = 25_000
+        task = replace(base, epsilon=((0.0, 1.0), (0.3, 0.1)))
+        budgets = {"go-down": 10_000, "lift": 20_000}
+        agent, decisions = base, 25_000
     else:
-        pretraining = replace(
-            base,
-            learning_rate=((0, 1e-3), (60_000, 1e-3), (160_000, 2e-4)),
-            epsilon=((0, 1.0), (60_000, 0.1)),
-            environments=32,
-            decisions_per_round=32,
-        )
-        steps = {"go-down": 60_000, "lift": 200_000}
-        agent = replace(
-            base, learning_rate=((0, 1e-3), (60_000, 1e-3), (120_000, 1e-4)), epsilon=((0, 1.0), (60_000, 0.05))
-        )
-        decisions = 120_000
-    rules = Rules(decision_limit=200)
-    task_rules = Rules(step_limit=100)
+        task = replace(base, epsilon=((0.0, 1.0), (0.4, 0.1)), environments=32, decisions_per_round=32)
+        budgets = {"go-down": 60_000, "lift": 160_000}
+        agent, decisions = base, 120_000
+    task_rules, rules = Rules(step_limit=100), Rules(decision_limit=200)
     return (
-        {name: Training(pretraining, task_rules, budget) for name, budget in steps.items()},
-        {WITH_OPTIONS: Training(agent, rules, decisions), FLAT: Training(agent, rules, decisions)},
+        {name: Training(task, task_rules, budget) for name, budget in budgets.items()},
+        {name: Training(agent, rules, decisions) for name in (WITH_OPTIONS, FLAT)},
     )
 
 
 def _paper(figure: str) -> tuple[dict[str, Training], dict[str, Training]]:
-    """SGD and exploration settings as in the authors' code; the epsilon knots of the 4x3 run are not known, so those of
-    the 6x4 run are scaled to its length."""
+    """As in the authors' code. The epsilon knots of their 4x3 run are not known; those of the 6x4 run are taken, as
+    fractions of the run."""
     decisions = 100_000 if figure == "2" else 500_000
+    agent = DQNConfig(
+        double=False,
+        learning_rate=((0.0, 1e-4), (1 / 40, 1e-4), (1 / 8, 5e-5)),
+        learning_starts=5000,
+        epsilon=((0.0, 1.0), (0.16, 0.3), (0.4, 0.01)),
+        environments=1,
+        decisions_per_round=1,
+        updates_per_round=1,
+    )
     task_rules = Rules(step_limit=100, bootstrap_at_limit=False)
-    # The authors' counter lets a run with options take one decision more.
-    rules = Rules(decision_limit=200, bootstrap_at_limit=False, undiscounted_option_reward=True)
-
-    def config(budget: int, epsilon: tuple[tuple[int, float], ...]) -> DQNConfig:
-        return DQNConfig(
-            double=False,
-            learning_rate=((0, 1e-4), (budget // 40, 1e-4), (budget // 8, 5e-5)),
-            learning_starts=5000,
-            epsilon=epsilon,
-            environments=1,
-            decisions_per_round=1,
-            updates_per_round=1,
-        )
 
     def task(budget: int) -> Training:
-        return Training(config(budget, ((0, 1.0), (8_000, 0.3), (budget // 4, 0.01))), task_rules, budget)
+        return Training(replace(agent, epsilon=((0.0, 1.0), (8_000 / budget, 0.3), (1 / 4, 0.01))), task_rules, budget)
 
-    agent = config(decisions, ((0, 1.0), (decisions * 4 // 25, 0.3), (decisions * 2 // 5, 0.01)))
+    rules = Rules(decision_limit=200, bootstrap_at_limit=False, undiscounted_option_reward=True)
     return (
         {"go-down": task(200_000), "lift": task(400_000)},
         {
+            # The authors' counter gives a run with options one decision more.
             WITH_OPTIONS: Training(agent, replace(rules, decision_limit=201), decisions),
             FLAT: Training(agent, rules, decisions),
         },
@@ -162,6 +142,15 @@ def _paper(figure: str) -> tuple[dict[str, Training], dict[str, Training]]:
 
 PRETRAINING_SEEDS = 2
 """Networks trained per option; the better one is kept."""
+
+
+def total_work(chosen: Sequence[Settings], seeds: int) -> float:
+    """All the work ahead, in the units that `run` reports."""
+    return sum(
+        sum(training.work for training in one.pretraining.values()) * PRETRAINING_SEEDS
+        + sum(training.work for training in one.agents.values()) * seeds
+        for one in chosen
+    )
 
 
 @dataclass(frozen=True)
@@ -177,9 +166,7 @@ def run(chosen: Settings, seeds: Sequence[int], progress: Progress, on_result: C
     """Pretrain the options, then train each learner on all seeds; `on_result` gets all there is after every learner."""
     environment = chosen.environment
     pretrained = [_pretrain(chosen, name, progress) for name in chosen.pretraining]
-    learned = as_options(pretrained)
-    # As tables the networks' greedy choices are the same in every reachable state, and running them costs a look-up.
-    temporal = Capped(as_tabular(learned, reachable_states(environment)), OPTION_CAP)
+    temporal = Capped(as_options(pretrained), OPTION_CAP)
     primitives = Primitives(environment.action_names)
     with_options = Union((primitives, temporal))
     tables = tabulate(environment)
@@ -196,7 +183,7 @@ def run(chosen: Settings, seeds: Sequence[int], progress: Progress, on_result: C
         agents=(),
         playback=None,
     )
-    trained = Trained(unfinished, Capped(learned, OPTION_CAP), {})
+    trained = Trained(unfinished, temporal, {})
     for name, training in chosen.agents.items():
         options = primitives if name == FLAT else with_options
         agent, policy = _train(chosen, name, training, options, seeds, best.optimal_return, progress)
@@ -255,23 +242,22 @@ def _train(
     progress: Progress,
 ) -> tuple[AgentRun, Policy]:
     """One learner on all seeds at once, and its greedy policies."""
-    config, environment = training.config, chosen.environment
-    algorithm = dqn(config, environment, options, training.rules, training.decisions)
-    history = History(len(seeds), options.size)
-    progress.begin(f"{chosen.name}: {name}", training.work * len(seeds))
-    rounds = config.rounds(training.decisions)
-    for carry, chunk in train(algorithm, seeds, rounds, config.rounds(DECISIONS_PER_CHUNK)):
-        history.add(chunk)
+    work = training.work * len(seeds)
+    progress.begin(f"{chosen.name}: {name}", work)
+
+    def tell(history: History, fraction: float) -> bool:
         recent = [history.episodes(position).total_reward[-50:] for position in range(len(seeds))]
         means = [f"{returns.mean():.0f}" if len(returns) else "-" for returns in recent]
-        progress.advance(chunk.rounds / rounds * training.work * len(seeds), f"mean returns {' '.join(means)}")
-        network = carry.learner.network
-    learned = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[: len(seeds)]), network)
-    policy = Policy("dqn", environment, options, training.rules, learned, config.reward_scale, tuple(seeds))
+        progress.advance(fraction * work, f"mean returns {' '.join(means)}")
+        return False
+
+    policy, history = train_policy(
+        training.config, chosen.environment, options, training.rules, training.decisions, seeds, tell
+    )
     agent = AgentRun(
         name=name,
         option_names=options.names,
-        primitives=environment.num_actions,
+        primitives=chosen.environment.num_actions,
         seeds=tuple(seeds),
         episodes=tuple(history.episodes(position) for position in range(len(seeds))),
         usage=tuple(history.usage),

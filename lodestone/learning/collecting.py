@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.envs.base import Environment, example_state
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Decision, Rules, start_actor, tick
 from lodestone.types import State, Transition
 
-Choose = Callable[[PRNGKeyArray, State], Int[Array, " N"]]
-"""choose(key, states [N, ...]) -> an option for each environment; ignored where an option is still running."""
+Choose = Callable[[Float[Array, "N 2"], State], Int[Array, " N"]]
+"""choose(uniform numbers, states [N, ...]) -> an option for each environment; ignored where one is still running."""
 
 
 def start_actors(environment: Environment, key: PRNGKeyArray, count: int) -> Actor:
@@ -26,10 +26,12 @@ def tick_all(
     environment: Environment, options: Options, rules: Rules, key: PRNGKeyArray, actors: Actor, choose: Choose
 ) -> tuple[Actor, Decision]:
     """One primitive step in each of N environments."""
-    choose_key, tick_key = jax.random.split(key)
-    choices = choose(choose_key, actors.state)
-    keys = jax.random.split(tick_key, choices.shape[0])
-    return jax.vmap(tick, in_axes=(None, None, None, 0, 0, 0))(environment, options, rules, keys, actors, choices)
+    count = actors.option.shape[0]
+    keys = jax.random.split(key, count + 1)
+    choices = choose(jax.random.uniform(keys[count], (count, 2)), actors.state)
+    return jax.vmap(tick, in_axes=(None, None, None, 0, 0, 0))(
+        environment, options, rules, keys[:count], actors, choices
+    )
 
 
 def collect(
@@ -49,19 +51,21 @@ def collect(
     """
 
     def unfinished(carry: tuple) -> Array:
-        return carry[3] < quota
+        _, _, count, _ = carry
+        return count < quota
 
     def step(carry: tuple) -> tuple:
-        key, actors, waiting, count = carry
-        key, tick_key = jax.random.split(key)
+        actors, waiting, count, ticks = carry
+        tick_key = jax.random.fold_in(key, ticks)
         actors, decisions = tick_all(environment, options, rules, tick_key, actors, choose)
         rank = jnp.cumsum(decisions.valid.astype(jnp.int32)) + count
         slot = jnp.where(decisions.valid, rank - 1, capacity)  # out of range: dropped
         waiting = jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), waiting, decisions)
-        return key, actors, waiting, rank[-1]
+        return actors, waiting, rank[-1], ticks + 1
 
     waiting = no_decisions(environment, options, capacity)
-    _, actors, waiting, _ = jax.lax.while_loop(unfinished, step, (key, actors, waiting, jnp.int32(0)))
+    start = (actors, waiting, jnp.int32(0), jnp.int32(0))
+    actors, waiting, _, _ = jax.lax.while_loop(unfinished, step, start)
     return actors, waiting
 
 

@@ -114,7 +114,7 @@ def train(
 def _run_chunk(
     algorithm: Algorithm, capacity: int, carry: Any, first: Int[Array, ""], count: Int[Array, ""]
 ) -> tuple[Any, RoundLog]:
-    """`count` rounds of one seed, at most `capacity`. The count is dynamic, so that one compilation serves all chunks."""
+    """`count` rounds of one seed, at most `capacity`. The count is dynamic: one compilation serves all chunks."""
     _, shapes = jax.eval_shape(algorithm.run_round, carry, first)
     empty = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), shapes)
 
@@ -131,6 +131,6 @@ def _require_finite(loss: Float[np.ndarray, "S R"], seeds: Sequence[int]) -> Non
     if bad.any():
         seed = seeds[int(np.argmax(bad))]
         raise Diverged(
-            f"The loss of seed {seed} is no longer a finite number; try a smaller learning rate, a smaller reward scale "
-            "or a smaller gradient norm."
+            f"The loss of seed {seed} is no longer a finite number; try a smaller learning rate, a smaller reward "
+            "scale or a smaller gradient norm."
         )

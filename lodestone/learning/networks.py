@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import equinox as eqx
 import jax
@@ -140,26 +141,31 @@ def init_q_network(
             "choose kernels, strides and channels empty, or observation 'rgb' or 'planes'."
         )
     shape = observation_shape
-    convolutions = []
-    keys = iter(jax.random.split(key, len(config.kernels) + len(config.hidden) + 1))
+    weights: list[tuple[int, ...]] = []
     for kernel, stride, channels in zip(config.kernels, config.strides, config.channels, strict=True):
         height, width, inputs = shape
-        weight = _glorot(next(keys), (kernel, kernel, inputs, channels))
-        convolutions.append(Convolution(weight, jnp.zeros(channels), stride))
+        weights.append((kernel, kernel, inputs, channels))
         shape = (-(-height // stride), -(-width // stride), channels)
-    widths = (math.prod(shape), *config.hidden, outputs)
-    layers = tuple(
-        Linear(_glorot(next(keys), (before, after)), jnp.zeros(after))
-        for before, after in zip(widths[:-1], widths[1:], strict=True)
+    weights += list(pairwise((math.prod(shape), *config.hidden, outputs)))
+
+    # One draw for all weights: every further random call would cost its own second of compilation.
+    sizes = [math.prod(weight) for weight in weights]
+    parts = jnp.split(jax.random.uniform(key, (sum(sizes),), minval=-1, maxval=1), list(accumulate(sizes))[:-1])
+    arrays = [_glorot_limit(weight) * part.reshape(weight) for weight, part in zip(weights, parts, strict=True)]
+    deep = len(config.kernels)
+    return QNetwork(
+        convolutions=tuple(
+            Convolution(array, jnp.zeros(array.shape[-1]), stride)
+            for array, stride in zip(arrays[:deep], config.strides, strict=True)
+        ),
+        layers=tuple(Linear(array, jnp.zeros(array.shape[-1])) for array in arrays[deep:]),
     )
-    return QNetwork(tuple(convolutions), layers)
 
 
-def _glorot(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Uniform with variance 2 / (inputs + outputs) (Glorot and Bengio 2010)."""
+def _glorot_limit(shape: tuple[int, ...]) -> float:
+    """Bound of a uniform draw with variance 2 / (inputs + outputs) (Glorot and Bengio 2010)."""
     receptive = math.prod(shape[:-2])
-    limit = math.sqrt(6 / (receptive * (shape[-2] + shape[-1])))
-    return jax.random.uniform(key, shape, minval=-limit, maxval=limit)
+    return math.sqrt(6 / (receptive * (shape[-2] + shape[-1])))
 
 
 def count_parameters(network: QNetwork) -> int:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
+
+from lodestone.envs.base import inverse_cdf
 
 
 def mask_unavailable(values: Float[Array, " O"], available: Bool[Array, " O"]) -> Float[Array, " O"]:
@@ -18,13 +19,12 @@ def greedy(values: Float[Array, " O"], available: Bool[Array, " O"]) -> Int[Arra
 
 
 def epsilon_greedy(
-    key: PRNGKeyArray, values: Float[Array, " O"], available: Bool[Array, " O"], epsilon: Float[Array, ""]
+    uniform: Float[Array, " 2"], values: Float[Array, " O"], available: Bool[Array, " O"], epsilon: Float[Array, ""]
 ) -> Int[Array, ""]:
-    """With probability epsilon any available option, otherwise one of the best; ties are broken uniformly at random,
-    since a first-best rule can lock an early policy into a loop."""
-    explore_key, pick_key = jax.random.split(key)
+    """With probability epsilon any available option, otherwise one of the best, by two uniform numbers in [0, 1).
+
+    Ties are broken uniformly at random, since a first-best rule can lock an early policy into a loop.
+    """
     masked = mask_unavailable(values, available)
-    explores = jax.random.uniform(explore_key) < epsilon
-    candidates = available & (explores | (masked == jnp.max(masked)))
-    tickets = jax.random.uniform(pick_key, values.shape)
-    return jnp.argmax(jnp.where(candidates, tickets, -1.0)).astype(jnp.int32)
+    candidates = available & ((uniform[0] < epsilon) | (masked == jnp.max(masked)))
+    return inverse_cdf(candidates.astype(jnp.float32), uniform[1])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Int, UInt32
 
 from lodestone.types import Transition
 
@@ -38,7 +38,10 @@ def add(replay: Replay, batch: Transition, valid: Bool[Array, " M"]) -> Replay:
     return Replay(storage, (replay.cursor + count) % capacity, jnp.minimum(replay.size + count, capacity))
 
 
-def sample(replay: Replay, key: PRNGKeyArray, batch_size: int) -> Transition:
-    """Transitions drawn uniformly with replacement. The replay must not be empty."""
-    index = jax.random.randint(key, (batch_size,), 0, replay.size)
+def sample(replay: Replay, bits: UInt32[Array, " B"]) -> Transition:
+    """B transitions drawn uniformly with replacement, by random bits. The replay must not be empty.
+
+    The remainder favours no transition by more than one part in 2^32 / size.
+    """
+    index = (bits % replay.size.astype(jnp.uint32)).astype(jnp.int32)
     return jax.tree.map(lambda leaf: leaf[index], replay.storage)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, sample_categorical, sample_initial, sample_step
+from lodestone.envs.base import Environment, inverse_cdf, sample_initial, sample_step
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import Options
 from lodestone.types import State, Transition
@@ -34,7 +34,7 @@ class Rules:
     """Whether a truncated episode's last transition bootstraps. False treats a limit as an end, as the authors' code
     does: a switch for reproduction only."""
     undiscounted_option_reward: bool = False
-    """Whether an option's reward is the plain sum of its steps' rewards (the paper's "accumulated reward"): a switch for
+    """Whether an option's reward is the plain sum of its steps' rewards (the paper's "accumulated reward"): for
     reproduction only, as the values then depend on the options."""
     call_cost: float = 0.0
     """Taken from the reward of every option that may run longer than one step, once a call."""
@@ -117,14 +117,16 @@ def tick(
 
     The environment restarts by itself after an episode's end; `Decision.transition.next_obs` is the state before that.
     """
-    action_key, outcome_key, termination_key, reset_key = jax.random.split(key, 4)
+    # Random numbers cost much in so small a program: the keys below are hashed only if the environment needs them.
+    uniform = jax.random.uniform(key, (2,))
+    outcome_key, reset_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
     fresh = actor.deciding
     option = jnp.where(fresh, choice, actor.option)
     start = _select(fresh, actor.state, actor.start)
     reward_before = jnp.where(fresh, 0.0, actor.reward)
     discount_before = jnp.where(fresh, 1.0, actor.discount)
 
-    action = sample_categorical(action_key, options.action_probs(actor.state)[option])
+    action = inverse_cdf(options.action_probs(actor.state)[option], uniform[0])
     state, reward, terminated = sample_step(environment, outcome_key, actor.state, action)
 
     elapsed = jnp.where(fresh, 0, actor.elapsed) + 1
@@ -137,7 +139,7 @@ def tick(
     episode_decisions = actor.episode_decisions + fresh.astype(jnp.int32)
 
     beta = options.termination(state)[option]
-    stops = (jax.random.uniform(termination_key) < beta) | (elapsed >= caps[option])
+    stops = (uniform[1] < beta) | (elapsed >= caps[option])
     truncated = jnp.bool_(False)
     if rules.step_limit is not None:
         truncated |= episode_steps >= rules.step_limit

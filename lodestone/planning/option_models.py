@@ -207,7 +207,7 @@ def expected_option_steps(
     tables: Tables, options: OptionTables, policy: Int[np.ndarray, " S"] | Float[np.ndarray, "S O"]
 ) -> Float[np.ndarray, " S"]:
     """Expected primitive steps [S] of a policy over options until the episode ends; inf where it may never end."""
-    return -evaluate_options(tables.with_step_reward(-1.0), options, policy, discount=1.0)
+    return 0.0 - evaluate_options(tables.with_step_reward(-1.0), options, policy, discount=1.0)
 
 
 def expected_decisions(
@@ -215,7 +215,7 @@ def expected_decisions(
 ) -> Float[np.ndarray, " S"]:
     """Expected decisions [S] of a policy over options until the episode ends; inf where it may never end."""
     rewards = np.full((tables.num_states, options.size), -1.0)
-    return -_evaluate(tables, options, policy, rewards, discount=1.0)
+    return 0.0 - _evaluate(tables, options, policy, rewards, discount=1.0)
 
 
 @jax.jit

@@ -117,7 +117,7 @@ def evaluate_policy(
 
 def expected_steps(tables: Tables, policy: Int[np.ndarray, " S"] | Float[np.ndarray, "S A"]) -> Float[np.ndarray, " S"]:
     """Expected primitive steps [S] until the episode ends; inf where the policy may go on for ever."""
-    return -evaluate_policy(tables.with_step_reward(-1.0), policy, discount=1.0)
+    return 0.0 - evaluate_policy(tables.with_step_reward(-1.0), policy, discount=1.0)
 
 
 def optimum(environment: Environment, discount: float = 0.99) -> Optimum:
@@ -189,7 +189,7 @@ def surely_ending(
         safe = allowed & ~(backup(1.0 - inside) > 0)
 
         def before(reached: Bool[np.ndarray, " S"], safe: Bool[np.ndarray, "N S"] = safe) -> Bool[np.ndarray, " S"]:
-            return (safe & (backup(reached.astype(np.float64)) > 0)).any(axis=0)
+            return np.logical_or.reduce(safe & (backup(reached.astype(np.float64)) > 0), axis=0)
 
         reached = _closure(terminal, before)
         if np.array_equal(reached, inside):

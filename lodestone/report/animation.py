@@ -10,8 +10,8 @@ import matplotlib as mpl
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from lodestone.experiments.comparison import Playback
-from lodestone.report.files import replace_file
+from lodestone.agents.playing import Playback
+from lodestone.files import write_atomically
 from lodestone.report.palette import GRID, INK, MUTED, option_colours, text_on
 
 MIN_WIDTH = 360
@@ -34,9 +34,6 @@ def write_gif(playback: Playback, path: str | Path) -> None:
     Raises `CannotWrite`.
     """
     frames = [_frame(playback, step) for step in range(len(playback.pictures))]
-    # One palette for all frames: colours stay still, and frames differ only where something moved.
-    colours = _montage(frames).quantize(255)
-    frames = [frame.quantize(palette=colours, dither=Image.Dither.NONE) for frame in frames]
     content = BytesIO()
     frames[0].save(
         content,
@@ -47,13 +44,7 @@ def write_gif(playback: Playback, path: str | Path) -> None:
         loop=0,
         optimize=True,
     )
-    replace_file(path, content.getvalue())
-
-
-def _montage(frames: list[Image.Image]) -> Image.Image:
-    """Some of the frames in one picture, to choose colours from."""
-    some = frames[:: max(len(frames) // 8, 1)]
-    return Image.fromarray(np.concatenate([np.asarray(frame) for frame in some]))
+    write_atomically(path, content.getvalue())
 
 
 def _frame(playback: Playback, step: int) -> Image.Image:
@@ -90,7 +81,8 @@ def _frame(playback: Playback, step: int) -> Image.Image:
 
 
 def _shortened(text: str, font: ImageFont.FreeTypeFont, width: float) -> str:
-    """The text, or as much of it as fits."""
+    """The text on one line, or as much of it as fits."""
+    text = " ".join(text.split())
     if font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "…") > width:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -15,20 +15,21 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from lodestone.experiments.comparison import AgentRun, Comparison
+from lodestone.files import write_atomically
 from lodestone.learning.history import Episodes, Usage, running_mean
-from lodestone.report.files import replace_file
-from lodestone.report.palette import GRID, INK, MUTED, agent_colours, option_colours
+from lodestone.report.palette import GRID, INK, MUTED, PAPER, agent_colours, option_colours
 from lodestone.report.statistics import estimate
 
 WINDOW = 30
 """Episodes in a running mean; the authors smooth so."""
-POINTS = 240
+POINTS = 160
 """x values of a curve, and at most so many of a usage diagram."""
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "text.color": INK,
+    "text.parse_math": False,  # a dollar sign in a name is a dollar sign
     "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
     "axes.titlesize": 9.5,
@@ -165,6 +166,8 @@ def draw_panel(axes: Axes, comparison: Comparison, axis: Axis, quantity: Quantit
             ha="left",
             va="top" if below else "bottom",
             fontsize=8,
+            zorder=1.5,  # above the grid, under the curves
+            bbox={"facecolor": PAPER, "alpha": 0.7, "edgecolor": "none", "pad": 1},
         )
     axes.margins(y=0.09)
     axes.set_xlim(left=0)
@@ -182,9 +185,9 @@ def _optima(comparison: Comparison, quantity: Quantity) -> list[tuple[float, str
     with_options = [has_options(agent) for agent in comparison.agents]
     optima = []
     if not all(with_options):
-        optima.append((steps, f"optimum of primitive actions {steps:g}", False))
+        optima.append((steps, f"optimum {steps:g} (primitive actions)", False))
     if any(with_options):
-        optima.append((decisions, f"fewest decisions with options {decisions:g}", True))
+        optima.append((decisions, f"optimum {decisions:g} (with options)", True))
     return optima
 
 
@@ -272,14 +275,15 @@ def _save(figure: Figure, path: str | Path) -> None:
     path = Path(path)
     content = BytesIO()
     figure.savefig(content, format=path.suffix.removeprefix(".") or "png")
-    replace_file(path, content.getvalue())
+    write_atomically(path, content.getvalue())
 
 
-def panel_svg(draw: Callable[[Axes], None], width: float = 5.2, height: float = 3.1) -> str:
+def panel_svg(draw: Callable[[Axes], None], width: float = 4.5, height: float = 2.9) -> str:
     """An SVG element of one panel, in inches, that `draw` fills; its background is transparent."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        draw(figure.subplots())
+        figure = Figure(figsize=(width, height))
+        # Fixed margins rather than a computed layout: panels under one another line up.
+        draw(figure.subplots(gridspec_kw={"left": 0.16, "right": 0.985, "bottom": 0.155, "top": 0.97}))
         content = BytesIO()
         figure.savefig(
             content, format="svg", transparent=True, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))

@@ -16,6 +16,7 @@ SLATE_DARK, SLATE_LIGHT = 0x48, 0xD0
 INK = "#1f2933"
 MUTED = "#66727f"
 GRID = "#dfe3e8"
+PAPER = "#ffffff"
 
 
 def agent_colours(count: int) -> tuple[str, ...]:
@@ -37,7 +38,7 @@ def text_on(colour: str) -> str:
     red, green, blue = (channel**2.2 for channel in channels)
     luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
     # Contrast as WCAG defines it is equal for both where the luminance is 0.18.
-    return INK if luminance > 0.2 else "#ffffff"
+    return INK if luminance > 0.2 else PAPER
 
 
 def _slate(count: int) -> list[str]:

@@ -5,18 +5,15 @@ The tables of the HTML report print the same numbers.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lodestone.experiments.comparison import AgentRun, Comparison, Gate
 from lodestone.learning.history import Episodes, first_above
-from lodestone.report.files import replace_file
 from lodestone.report.statistics import estimate
 
 THRESHOLD_WINDOW = 50
@@ -85,8 +82,9 @@ def agent_rows(agent: AgentRun, thresholds: Sequence[float]) -> tuple[Row, ...]:
         moments.append((f"Mean return above {threshold:g}", reached))
     rows = []
     for label, per_seed in moments:
-        rows.append(Row(label, "decisions", summarise([moment and moment.decisions for moment in per_seed])))
-        rows.append(Row(label, "primitive steps", summarise([moment and moment.steps for moment in per_seed])))
+        decisions = [moment.decisions if moment else None for moment in per_seed]
+        steps = [moment.steps if moment else None for moment in per_seed]
+        rows += [Row(label, "decisions", summarise(decisions)), Row(label, "primitive steps", summarise(steps))]
     greedy = agent.greedy
     rows += (
         Row("Greedy episode", "primitive steps", summarise([each.steps if each.success else None for each in greedy])),
@@ -129,7 +127,9 @@ def _agent(agent: AgentRun, thresholds: Sequence[float]) -> dict[str, object]:
         "name": agent.name,
         "option_names": agent.option_names,
         "seconds": agent.seconds,
-        "summary": [{"label": row.label, "unit": row.unit, **vars(row.summary)} for row in agent_rows(agent, thresholds)],
+        "summary": [
+            {"label": row.label, "unit": row.unit, **vars(row.summary)} for row in agent_rows(agent, thresholds)
+        ],
         "seeds": [
             {
                 "seed": greedy.seed,
@@ -146,31 +146,3 @@ def _agent(agent: AgentRun, thresholds: Sequence[float]) -> dict[str, object]:
             for episodes, greedy in zip(agent.episodes, agent.greedy, strict=True)
         ],
     }
-
-
-def json_safe(value: object) -> Any:
-    """The same in JSON's types: data classes and named tuples as objects, arrays as lists, not-finite numbers as None,
-    anything else as its text."""
-    match value:
-        case None | bool() | int() | str():
-            return value
-        case np.generic() | np.ndarray():
-            return json_safe(value.tolist())
-        case float():
-            return value if math.isfinite(value) else None
-        case Mapping():
-            return {str(key): json_safe(each) for key, each in value.items()}
-        case tuple() if hasattr(value, "_asdict"):
-            return json_safe(value._asdict())
-        case list() | tuple():
-            return [json_safe(each) for each in value]
-        case _ if hasattr(value, "__dataclass_fields__"):
-            return {name: json_safe(getattr(value, name)) for name in value.__dataclass_fields__}
-        case _:
-            return str(value)
-
-
-def write_json(path: str | Path, value: object) -> None:
-    """Write `value` as indented JSON, all of it or nothing. Raises `CannotWrite`."""
-    text = json.dumps(json_safe(value), indent=2, ensure_ascii=False, allow_nan=False)
-    replace_file(path, f"{text}\n".encode())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lodestone.envs.base import Environment
 from lodestone.options.base import NO_CAP, Options
 from lodestone.planning.option_models import OptionTables
-from lodestone.planning.tables import Tables
+from lodestone.planning.tables import Tables, tabulate
 
 NUM_STATES, NUM_ACTIONS = 7, 3
 
@@ -59,10 +61,27 @@ class RandomMDP(Environment):
 
 def random_mdp(seed: int, goals: int = 0) -> RandomMDP:
     """P ~ Dirichlet(.4), R ~ N(0, 1)."""
+    probs, rewards = _random_arrays(seed)
+    return RandomMDP(jnp.asarray(probs, jnp.float32), jnp.asarray(rewards, jnp.float32), goals)
+
+
+def random_tables(seed: int, goals: int = 0) -> Tables:
+    """The tables of such a process, without the search for its states, which compiles anew for each environment."""
+    tables = _tables_to_fill(goals)
+    probs, rewards = _random_arrays(seed)
+    live = ~tables.terminal[:, None, None]
+    return tables._replace(probs=np.where(live, probs, tables.probs), rewards=np.where(live, rewards, 0.0))
+
+
+def _random_arrays(seed: int) -> tuple[Float[np.ndarray, "S A S"], Float[np.ndarray, "S A S"]]:
     rng = np.random.default_rng(seed)
     probs = rng.dirichlet(np.full(NUM_STATES, 0.4), size=(NUM_STATES, NUM_ACTIONS))
-    rewards = rng.normal(size=probs.shape)
-    return RandomMDP(jnp.asarray(probs, jnp.float32), jnp.asarray(rewards, jnp.float32), goals)
+    return probs, rng.normal(size=probs.shape)
+
+
+@cache
+def _tables_to_fill(goals: int) -> Tables:
+    return tabulate(random_mdp(0, goals))
 
 
 class RandomOptions(Options):
@@ -125,7 +144,7 @@ def simulated_model(
     probs, rewards = dense(tables)
     acts = options.action_probs[option] / options.action_probs[option].sum(axis=1, keepdims=True, dtype=np.float64)
     step, pay = np.einsum("sa,sax->sx", acts, probs), np.einsum("sa,sa->s", acts, rewards)
-    stops = np.where(tables.terminal, 1.0, options.termination[option])
+    stops = np.where(tables.terminal, 1.0, options.termination[option].astype(np.float64))
     running, total, ended = np.eye(len(pay)), np.zeros(len(pay)), np.zeros((len(pay), len(pay)))
     for elapsed in range(min(options.max_steps[option], horizon)):
         total += reward_discount**elapsed * running @ pay
@@ -133,5 +152,6 @@ def simulated_model(
         stopping = np.ones_like(stops) if elapsed + 1 == options.max_steps[option] else stops
         ended += discount ** (elapsed + 1) * arrived * stopping
         running = arrived * (1.0 - stopping)
+        if running.max() < 1e-15:
+            break
     return total, ended
-

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from functools import cache
 
+import jax
 import numpy as np
 
+from lodestone.agents.playing import Playback
 from lodestone.envs.magnet_arm import DOWN, LEFT, MAGNET_OFF, MAGNET_ON, RIGHT, UP, MagnetArm
-from lodestone.experiments.comparison import AgentRun, Comparison, Gate, GreedyResult, OptionRun, Playback
+from lodestone.experiments.comparison import AgentRun, Comparison, Gate, GreedyResult, OptionRun
 from lodestone.learning.history import Episodes, Usage
 
 ACTIONS = ("left", "up", "right", "down", "magnet-on", "magnet-off")
@@ -62,9 +64,7 @@ def make_agent(
     """One agent; its last seed does not solve the task unless it has options."""
     names = OPTIONS if with_options else ACTIONS
     ratio = 1.6 if with_options else 1.0
-    episodes = tuple(
-        make_episodes(rng, optimum, learnt_at + rng.normal(0, 0.05), ratio, budget) for _ in range(seeds)
-    )
+    episodes = tuple(make_episodes(rng, optimum, learnt_at + rng.normal(0, 0.05), ratio, budget) for _ in range(seeds))
     greedy = []
     for seed in range(seeds):
         success = with_options or seed < seeds - 1
@@ -90,7 +90,8 @@ def make_playback() -> Playback:
     """A real way to build the tower of the 4 x 3 arm, with invented values."""
     arm = MagnetArm()
     _, starts = arm.initial_distribution()
-    state = type(starts)(*(leaf[0] for leaf in starts))
+    state = jax.tree.map(lambda leaf: leaf[0], starts)
+    transition = jax.jit(arm.transition)
     plan = (
         (LIFT, (DOWN, DOWN, MAGNET_ON, UP, UP)),
         (RIGHT, (RIGHT,)),
@@ -104,7 +105,7 @@ def make_playback() -> Playback:
     pictures, option, chosen, action = [arm.render(state)], [], [], []
     for which, primitives in plan:
         for number, primitive in enumerate(primitives):
-            state = arm.transition(state, np.int32(primitive), np.int32(0))
+            state = transition(state, np.int32(primitive), np.int32(0))
             pictures.append(arm.render(state))
             option.append(which)
             chosen.append(number == 0)
@@ -132,6 +133,7 @@ def make_playback() -> Playback:
     )
 
 
+@cache
 def make_comparison(name: str = "figure-2", seeds: int = 6, budget: int = 50_000) -> Comparison:
     """A small and a large problem: figure-2 and figure-3."""
     rng = np.random.default_rng(7)
@@ -170,3 +172,8 @@ SETTINGS: dict[str, object] = {
     "version": "0.1.0",
     "dqn": {"learning_rate": 5e-4, "batch_size": 32, "hidden": (64, 64)},
 }
+
+
+def seeds_that_differ(seeds: int) -> np.ndarray:
+    """One number per seed, with a long tail."""
+    return np.random.default_rng(11).lognormal(3.0, 0.7, seeds)

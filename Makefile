@@ -1,0 +1,36 @@
+# `make reproduce` and `make test` work on a fresh machine with Python 3.11 or newer and nothing else:
+# they make a virtual environment in .venv and install what they need there.
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: reproduce test lint gates benchmarks clean
+
+reproduce: .venv/installed
+	$(BIN)/lodestone reproduce
+
+test: .venv/installed
+	$(BIN)/python -m pytest
+
+lint: .venv/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+gates: .venv/installed
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+benchmarks: .venv/installed
+	$(BIN)/python -m pip install -c constraints.txt -e '.[benchmarks]'
+	$(BIN)/python benchmarks/environment.py
+	$(BIN)/python benchmarks/training.py
+
+# The stamp is newer than what it was installed from, so a change of dependencies installs again.
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("Lodestone needs Python 3.11 or newer; run: make PYTHON=python3.11 ..." if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv out

@@ -1,0 +1,444 @@
+"""The command line: builds configurations, calls functions, prints.
+
+Exit codes: 0 done, 2 bad input (one sentence on standard error), 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
+
+import jax
+import tyro
+from rich.console import Console
+from rich.table import Table
+from tyro.conf import OmitArgPrefixes, Positional
+
+from lodestone import __version__
+from lodestone.agents.playing import play, record
+from lodestone.agents.pretraining import as_options, pretrain
+from lodestone.agents.run_folder import POLICY, RunFolder
+from lodestone.agents.saved import load_options, load_policy, save_options
+from lodestone.agents.training import AGENTS, AgentConfig, train_policy
+from lodestone.console import ConsoleProgress
+from lodestone.devices import use_all_cores
+from lodestone.envs.base import Environment
+from lodestone.envs.registry import ENVIRONMENTS, describe_environment, environment_class
+from lodestone.errors import InvalidConfig, LodestoneError, TooManyStates, check_name
+from lodestone.experiments import magnet_tower
+from lodestone.experiments.comparison import Gate
+from lodestone.files import json_safe, prepare_folder
+from lodestone.learning.history import History
+from lodestone.learning.networks import NetworkConfig
+from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.catalogue import scripted_options, tasks
+from lodestone.options.execution import Rules
+from lodestone.planning.option_models import check_available, fewest_decisions, tabulate_options
+from lodestone.planning.solve import optimum
+from lodestone.planning.tables import tabulate
+
+AgentT = TypeVar("AgentT", bound=AgentConfig)
+EnvironmentT = TypeVar("EnvironmentT", bound=Environment)
+
+USAGE = f"""usage: lodestone COMMAND ...
+
+Hierarchical reinforcement learning with options, each learner beside the exact optimum.
+
+commands:
+  reproduce                  the paper's two experiments: figures, report, numbers
+  train AGENT ENVIRONMENT    train an agent ({", ".join(AGENTS)})
+  pretrain ENVIRONMENT       train an environment's options as Q-networks
+  watch RUN                  play a saved policy
+  plan ENVIRONMENT           the exact optimum
+
+environments: {", ".join(ENVIRONMENTS)}
+
+Add --help after a command and its names for all settings. lodestone --version prints the version.
+"""
+
+
+@dataclass(frozen=True)
+class Plan(Generic[EnvironmentT]):
+    """The exact optimum of an environment, by enumeration and value iteration."""
+
+    environment: EnvironmentT
+    discount: float = 0.99
+    """Discount of the discounted value."""
+    options: tuple[str, ...] = ()
+    """Hand-written options to plan with beside the primitive actions: adds the fewest decisions."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Train(Generic[AgentT, EnvironmentT]):
+    """Train an agent on an environment, several seeds at once."""
+
+    agent: AgentT
+    environment: EnvironmentT
+    rules: Rules = dataclasses.field(default_factory=lambda: Rules(decision_limit=200))
+    steps: int = 50_000
+    """Primitive steps per seed; with options, training ends at the first report after so many."""
+    seed: int = 0
+    """The first seed."""
+    seeds: int = 1
+    """How many seeds, trained at once."""
+    options: tuple[str, ...] = ()
+    """Hand-written options by name, or one file of saved options."""
+    option_cap: int = magnet_tower.OPTION_CAP
+    """Steps after which an option is stopped."""
+    primitives: bool = True
+    """Whether the agent may choose primitive actions besides the options."""
+    out: Path | None = None
+    """Folder for config.json, metrics.jsonl and policy.safetensors; without it nothing is saved."""
+    json: bool = False
+    """Print one JSON object at the end."""
+
+
+@dataclass(frozen=True)
+class Pretrain(Generic[EnvironmentT]):
+    """Train an environment's options as Q-networks on their own tasks, and judge them from every start."""
+
+    environment: EnvironmentT
+    out: Path
+    """File to write, for `train --options` (.safetensors)."""
+    network: NetworkConfig = dataclasses.field(
+        default_factory=lambda: NetworkConfig(kernels=(3,), strides=(3,), channels=(32,), hidden=(128,))
+    )
+    decisions: int = 160_000
+    """Budget per option and seed; training ends sooner where an option is good enough."""
+    seeds: int = 2
+    """Networks per option, of which the best is kept."""
+    option_cap: int = magnet_tower.OPTION_CAP
+    """Steps within which an option must complete its task."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Play a saved policy greedily: in the terminal, or as a GIF or an HTML page."""
+
+    run: Positional[Path]
+    """A run's folder, or a policy file."""
+    position: int = 0
+    """Which of the policy's seeds, counted from 0."""
+    gif: Path | None = None
+    """Write an animation instead of playing in the terminal."""
+    html: Path | None = None
+    """Write a page with a player instead of playing in the terminal."""
+    delay: float = 0.4
+    """Seconds per step in the terminal."""
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Reproduce the paper: pretrain the options, train DQN with options and DQN, and set both beside the optimum."""
+
+    figure: Literal["2", "3", "all"] = "all"
+    """2: a 4x3 grid with 3 bricks. 3: a 6x4 grid with 4 bricks."""
+    seeds: int = 6
+    """Seeds per curve, trained at once."""
+    preset: Literal["fast", "paper"] = "fast"
+    """fast: our tuning of the same algorithms. paper: the authors' protocol."""
+    out: Path = Path("out/reproduce")
+    """Folder for report.html, the figures, results.json, the animation and what was learned."""
+    json: bool = False
+    """Print results.json on standard output, too."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(USAGE, end="")
+        return 0
+    if words[0] == "--version":
+        print(f"lodestone {__version__}")
+        return 0
+    use_all_cores()
+    try:
+        _run(words)
+    except LodestoneError as error:
+        print(f"lodestone: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nlodestone: interrupted.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _run(words: list[str]) -> None:
+    command, rest = words[0], words[1:]
+    check_name("command", command, ("reproduce", "train", "pretrain", "watch", "plan"))
+    match command:
+        case "reproduce":
+            _reproduce(_parse(Reproduce, "reproduce", rest))
+        case "watch":
+            _watch(_parse(Watch, "watch", rest))
+        case "plan":
+            environment, rest = _take_name("environment", tuple(ENVIRONMENTS), command, rest)
+            _plan(_parse(Plan[environment_class(environment)], f"plan {environment}", rest))
+        case "pretrain":
+            environment, rest = _take_name("environment", tuple(ENVIRONMENTS), command, rest)
+            _pretrain(_parse(Pretrain[environment_class(environment)], f"pretrain {environment}", rest))
+        case "train":
+            agent, rest = _take_name("agent", tuple(AGENTS), command, rest)
+            environment, rest = _take_name("environment", tuple(ENVIRONMENTS), f"train {agent}", rest)
+            settings = Train[AGENTS[agent], environment_class(environment)]
+            _train(_parse(settings, f"train {agent} {environment}", rest), agent)
+
+
+def _take_name(kind: str, known: tuple[str, ...], command: str, words: list[str]) -> tuple[str, list[str]]:
+    if not words or words[0].startswith("-"):
+        raise InvalidConfig(f"`lodestone {command}` needs the name of an {kind}; there are: {', '.join(known)}.")
+    check_name(kind, words[0], known)
+    return words[0], words[1:]
+
+
+def _parse(settings: Any, command: str, words: list[str]) -> Any:
+    """Parsing errors leave with exit code 2 from inside tyro, after one boxed sentence."""
+    return tyro.cli(OmitArgPrefixes[settings], args=words, prog=f"lodestone {command}")
+
+
+def _plan(plan: Plan) -> None:
+    found = optimum(plan.environment, plan.discount)
+    content = describe_environment(plan.environment) | found._asdict()
+    if plan.options:
+        tables = tabulate(plan.environment)
+        options = tabulate_options(
+            Union((Primitives(plan.environment.action_names), scripted_options(plan.environment, plan.options))),
+            tables.space,
+        )
+        content["optimal_decisions"] = -tables.initial_mean(fewest_decisions(tables, options).values)
+    if plan.json:
+        _print_json(content)
+        return
+    parameters = ", ".join(f"{name} {value}" for name, value in content["parameters"].items())
+    table = Table(title=f"{content['name']} ({parameters})", show_header=False, title_justify="left")
+    table.add_row("reachable states", f"{found.states:,}")
+    table.add_row("terminal states among them", f"{found.goals:,}")
+    table.add_row("optimal steps", f"{found.optimal_steps:g}")
+    table.add_row("optimal return", f"{found.optimal_return:g}")
+    table.add_row(f"optimal value, discount {found.discount:g}", f"{found.discounted_value:.4f}")
+    if plan.options:
+        table.add_row(f"fewest decisions with {', '.join(plan.options)}", f"{content['optimal_decisions']:g}")
+    Console().print(table)
+
+
+def _choose_options(train: Train) -> Options:
+    """What the agent chooses from. Raises `NoOptionAvailable` where a reachable state has nothing."""
+    environment = train.environment
+    parts: list[Options] = [Primitives(environment.action_names)] if train.primitives else []
+    if train.options:
+        first = Path(train.options[0])
+        is_file = len(train.options) == 1 and (first.suffix or first.exists())
+        temporal = load_options(first, environment) if is_file else scripted_options(environment, train.options)
+        parts.append(Capped(temporal, train.option_cap))
+    options = Union(tuple(parts))
+    if not train.primitives:
+        tables = tabulate(environment)
+        check_available(tables, tabulate_options(options, tables.space))
+    return options
+
+
+def _train(train: Train, agent: str) -> None:
+    if train.seeds < 1:
+        raise InvalidConfig(f"seeds is {train.seeds}, but must be at least 1.")
+    if train.steps < 1:
+        raise InvalidConfig(f"steps is {train.steps}, but must be at least 1.")
+    environment, rules = train.environment, train.rules
+    options = _choose_options(train)
+    seeds = tuple(range(train.seed, train.seed + train.seeds))
+    folder = None
+    if train.out is not None:
+        config = {
+            "agent": {"name": agent, **dataclasses.asdict(train.agent)},
+            "environment": describe_environment(environment),
+            "rules": dataclasses.asdict(rules),
+            "options": list(options.names),
+            "steps": train.steps,
+            "seeds": list(seeds),
+        }
+        folder = RunFolder(train.out, config)
+    with ConsoleProgress(1.0) as progress:
+        progress.begin(f"{agent} on {describe_environment(environment)['name']}", 1.0)
+
+        def tell(history: History, fraction: float) -> bool:
+            steps = min(history.taken(position)[1] for position in range(len(seeds)))
+            returns = [history.episodes(position).total_reward[-50:] for position in range(len(seeds))]
+            means = " ".join(f"{values.mean():.1f}" if len(values) else "-" for values in returns)
+            progress.advance(max(fraction, min(1.0, steps / train.steps)), f"{steps:,} steps, mean return {means}")
+            if folder is not None:
+                folder.log(history, seeds, options.names)
+            return steps >= train.steps
+
+        policy, history = train_policy(train.agent, environment, options, rules, train.steps, seeds, tell)
+    if folder is not None:
+        folder.finish(policy)
+
+    try:
+        best = optimum(environment)
+    except TooManyStates:
+        best = None
+    greedy = [play(policy, position, jax.random.key(seed)) for position, seed in enumerate(seeds)]
+    content = {
+        "agent": agent,
+        "environment": describe_environment(environment),
+        "optimal_return": best.optimal_return if best else None,
+        "optimal_steps": best.optimal_steps if best else None,
+        "seeds": [
+            {
+                "seed": seed,
+                "decisions": history.taken(position)[0],
+                "steps": history.taken(position)[1],
+                "episodes": len(history.episodes(position).total_reward),
+                "greedy_return": float(greedy[position].total_reward),
+                "greedy_steps": int(greedy[position].steps),
+                "greedy_decisions": int(greedy[position].decisions),
+                "success": bool(greedy[position].success),
+                "gap": best.optimal_return - float(greedy[position].total_reward) if best else None,
+            }
+            for position, seed in enumerate(seeds)
+        ],
+        "seconds": round(history.seconds, 3),
+        "out": str(train.out) if train.out else None,
+    }
+    if train.json:
+        _print_json(content)
+        return
+    table = Table(title=f"Greedy policies after training ({history.seconds:.0f} s)", title_justify="left")
+    for column in ("seed", "steps trained", "return", "optimal return", "steps", "decisions", "reached the goal"):
+        table.add_column(column, justify="right")
+    for row in content["seeds"]:
+        table.add_row(
+            str(row["seed"]),
+            f"{row['steps']:,}",
+            f"{row['greedy_return']:g}",
+            f"{best.optimal_return:g}" if best else "unknown",
+            str(row["greedy_steps"]),
+            str(row["greedy_decisions"]),
+            "yes" if row["success"] else "no",
+        )
+    Console().print(table)
+    if train.out is not None:
+        print(f"Saved in {train.out}; `lodestone watch {train.out}` plays it.")
+
+
+def _pretrain(settings: Pretrain) -> None:
+    environment = settings.environment
+    found = tasks(environment)
+    if not found:
+        raise InvalidConfig(f"{describe_environment(environment)['name']} has no training tasks for options.")
+    prepare_folder(settings.out.parent)
+    training = magnet_tower.settings("3", "fast").pretraining["lift"]
+    config = dataclasses.replace(training.config, network=settings.network)
+    pretrained = []
+    with ConsoleProgress(float(len(found))) as progress:
+        for task in found:
+            progress.begin(task.name, 1.0)
+
+            def tell(taken: int, judgement: Any) -> None:
+                text = f"success {judgement.success:.0%}, mean length {judgement.mean_steps:.2f}"
+                progress.advance(taken / settings.decisions, text)
+
+            pretrained.append(
+                pretrain(
+                    task,
+                    config,
+                    training.rules,
+                    settings.decisions,
+                    range(settings.seeds),
+                    settings.option_cap,
+                    tell,
+                )
+            )
+    save_options(settings.out, as_options(pretrained), environment)
+    rows = [
+        {
+            "option": one.task.name,
+            "success": one.judgement.success,
+            "starts": one.judgement.starts,
+            "mean_steps": None if math.isnan(one.judgement.mean_steps) else one.judgement.mean_steps,
+            "optimal_mean_steps": one.optimal_steps,
+            "decisions": one.decisions,
+            "seconds": round(one.seconds, 3),
+        }
+        for one in pretrained
+    ]
+    if settings.json:
+        _print_json({"environment": describe_environment(environment), "options": rows, "out": str(settings.out)})
+        return
+    table = Table(title="Options, judged from every start of their tasks", title_justify="left")
+    for column in rows[0]:
+        table.add_column(column.replace("_", " "), justify="right")
+    for row in rows:
+        table.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()))
+    Console().print(table)
+    print(f"Saved in {settings.out}; `lodestone train dqn ... --options {settings.out}` uses them.")
+
+
+def _watch(watch: Watch) -> None:
+    from lodestone.report import animation, html, terminal  # pictures are only needed here and in `reproduce`
+
+    path = watch.run / POLICY if watch.run.is_dir() else watch.run
+    policy = load_policy(path)
+    if not 0 <= watch.position < len(policy.seeds):
+        raise InvalidConfig(
+            f"position is {watch.position}, but {path} holds {len(policy.seeds)} seeds, counted from 0."
+        )
+    playback = record(policy, watch.position, jax.random.key(policy.seeds[watch.position]), policy.agent)
+    for target, write in ((watch.gif, animation.write_gif), (watch.html, html.write_player)):
+        if target is not None:
+            prepare_folder(target.parent)
+            write(playback, target)
+            print(f"Wrote {target}.")
+    if watch.gif is None and watch.html is None:
+        terminal.show(playback, watch.delay)
+
+
+def _reproduce(settings: Reproduce) -> None:
+    from lodestone.report.reproduction import Reproduction  # matplotlib is only needed here
+
+    if settings.seeds < 1:
+        raise InvalidConfig(f"seeds is {settings.seeds}, but must be at least 1.")
+    figures = magnet_tower.FIGURES if settings.figure == "all" else (settings.figure,)
+    chosen = [magnet_tower.settings(figure, settings.preset) for figure in figures]
+    reproduction = Reproduction(prepare_folder(settings.out), settings.preset, settings.seeds, settings.figure)
+    try:
+        with ConsoleProgress(magnet_tower.total_work(chosen, settings.seeds)) as progress:
+            for one in chosen:
+                magnet_tower.run(one, range(settings.seeds), progress, reproduction.save)
+    except KeyboardInterrupt:
+        finished = ", ".join(reproduction.finished) or "nothing yet"
+        print(f"\nInterrupted. Finished and kept in {settings.out}: {finished}.", file=sys.stderr)
+        raise
+    if settings.json:
+        _print_json(reproduction.results())
+        return
+    _print_gates(reproduction.gates())
+    print(f"Wrote {settings.out / 'report.html'} and, beside it: {', '.join(reproduction.files)}.")
+
+
+def _print_gates(gates: Sequence[Gate]) -> None:
+    table = Table(title="What must come out", title_justify="left")
+    for column, justify in (("", "left"), ("measured", "right"), ("required", "right"), ("", "left")):
+        table.add_column(column, justify=justify)
+    for gate in gates:
+        table.add_row(gate.name, f"{gate.measured:.4g}", gate.required, "passed" if gate.passed else "MISSED")
+    Console().print(table)
+
+
+def _print_json(content: Any) -> None:
+    """One JSON object; infinities and NaN, which JSON lacks, become null."""
+    print(json.dumps(json_safe(content), indent=2, allow_nan=False))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
