@@ -184,15 +184,20 @@ def _run(words: list[str]) -> None:
             _watch(_parse(Watch, "watch", rest))
         case "plan":
             environment, rest = _take_name("environment", tuple(ENVIRONMENTS), command, rest)
-            _plan(_parse(Plan[environment_class(environment)], f"plan {environment}", rest))
+            _plan(_parse(_of(Plan, environment_class(environment)), f"plan {environment}", rest))
         case "pretrain":
             environment, rest = _take_name("environment", tuple(ENVIRONMENTS), command, rest)
-            _pretrain(_parse(Pretrain[environment_class(environment)], f"pretrain {environment}", rest))
+            _pretrain(_parse(_of(Pretrain, environment_class(environment)), f"pretrain {environment}", rest))
         case "train":
             agent, rest = _take_name("agent", tuple(AGENTS), command, rest)
             environment, rest = _take_name("environment", tuple(ENVIRONMENTS), f"train {agent}", rest)
-            settings = Train[AGENTS[agent], environment_class(environment)]
+            settings = _of(Train, AGENTS[agent], environment_class(environment))
             _train(_parse(settings, f"train {agent} {environment}", rest), agent)
+
+
+def _of(command: Any, *kinds: type) -> Any:
+    """A command's settings for an agent and an environment that are known only now."""
+    return command[kinds]
 
 
 def _take_name(kind: str, known: tuple[str, ...], command: str, words: list[str]) -> tuple[str, list[str]]:
@@ -204,7 +209,7 @@ def _take_name(kind: str, known: tuple[str, ...], command: str, words: list[str]
 
 def _parse(settings: Any, command: str, words: list[str]) -> Any:
     """Parsing errors leave with exit code 2 from inside tyro, after one boxed sentence."""
-    return tyro.cli(OmitArgPrefixes[settings], args=words, prog=f"lodestone {command}")
+    return tyro.cli(settings, args=words, prog=f"lodestone {command}", config=(OmitArgPrefixes,))
 
 
 def _plan(plan: Plan) -> None:
@@ -288,7 +293,7 @@ def _train(train: Train, agent: str) -> None:
     except TooManyStates:
         best = None
     greedy = [play(policy, position, jax.random.key(seed)) for position, seed in enumerate(seeds)]
-    content = {
+    content: dict[str, Any] = {
         "agent": agent,
         "environment": describe_environment(environment),
         "optimal_return": best.optimal_return if best else None,
@@ -427,9 +432,7 @@ def _reproduce(settings: Reproduce) -> None:
 
 
 def _print_gates(gates: Sequence[Gate]) -> None:
-    table = Table(title="What must come out", title_justify="left")
-    for column, justify in (("", "left"), ("measured", "right"), ("required", "right"), ("", "left")):
-        table.add_column(column, justify=justify)
+    table = Table("", "measured", "required", "", title="What must come out", title_justify="left")
     for gate in gates:
         table.add_row(gate.name, f"{gate.measured:.4g}", gate.required, "passed" if gate.passed else "MISSED")
     Console().print(table)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -141,11 +141,15 @@ def _describe_options(options: Options, prefix: str) -> tuple[Recipe, Arrays]:
         case Scripted():
             return {"kind": "scripted", "names": list(options.names)}, {}
         case NetworkOptions():
-            recipe = {"kind": "networks", "names": list(options.names), "network": _describe_network(options.networks)}
-            return recipe, _named_arrays(options.networks, prefix)
+            network = _describe_network(cast(QNetwork, options.networks))
+            return {
+                "kind": "networks",
+                "names": list(options.names),
+                "network": network,
+            }, _named_arrays(options.networks, prefix)
         case TabularOptions():
-            recipe = {"kind": "tabular", "names": list(options.names), "caps": list(options.caps)}
-            return recipe, _named_arrays({name: getattr(options, name) for name in TABLES}, prefix)
+            tables = _named_arrays({name: getattr(options, name) for name in TABLES}, prefix)
+            return {"kind": "tabular", "names": list(options.names), "caps": list(options.caps)}, tables
         case Capped():
             recipe, arrays = _describe_options(options.options, prefix)
             return {"kind": "capped", "cap": options.cap, "options": recipe}, arrays
@@ -174,12 +178,12 @@ def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Env
             space = reachable_states(environment)
             names, caps = tuple(recipe["names"]), tuple(recipe["caps"])
             shape = (space.size, len(names))
-            template = {
+            tables = {
                 "initiation_table": jax.ShapeDtypeStruct(shape, bool),
                 "policy_table": jax.ShapeDtypeStruct((*shape, environment.num_actions), jnp.float32),
                 "termination_table": jax.ShapeDtypeStruct(shape, jnp.float32),
             }
-            return TabularOptions(space, names, caps, **_fill(template, arrays, prefix))
+            return TabularOptions(space, names, caps, **_fill(tables, arrays, prefix))
         case "capped":
             return Capped(_build_options(recipe["options"], arrays, prefix, environment), int(recipe["cap"]))
         case "union":

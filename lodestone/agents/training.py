@@ -49,7 +49,7 @@ def train_policy(
             algorithm = q_learning(config, environment, options, rules, length)
 
     history = History(len(seeds), options.size)
-    for carry, chunk in train(algorithm, seeds, rounds, -(-rounds // CHUNKS)):  # noqa: B007 (the last is kept)
+    for carry, chunk in train(algorithm, seeds, rounds, -(-rounds // CHUNKS)):
         history.add(chunk)
         if on_chunk(history, chunk.rounds / rounds):
             break

@@ -80,8 +80,9 @@ def inverse_cdf(probs: Float[Array, " K"], uniform: Float[Array, ""]) -> Int[Arr
 
     One number a draw, where a Gumbel draw would take K.
     """
-    edges = jnp.cumsum(probs)
-    return jnp.sum(uniform * edges[-1] >= edges[:-1]).astype(jnp.int32)
+    # A cumulative sum rounds out of order, so that it may rise, or fall, where nothing was added.
+    edges = jnp.where(probs > 0, jnp.cumsum(probs), 0.0)
+    return jnp.argmax(edges > uniform * jnp.max(edges)).astype(jnp.int32)
 
 
 def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Array, ""]:

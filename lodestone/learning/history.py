@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -48,32 +49,28 @@ class History:
 
     def add(self, chunk: Chunk) -> None:
         """Append what a chunk brought."""
-        log = chunk.log
+        log = jax.tree.map(np.asarray, chunk.log)
         seeds = log.valid.shape[0]
         calls = np.zeros((seeds, self._options), dtype=np.int64)
         steps = np.zeros((seeds, self._options), dtype=np.int64)
         for seed in range(seeds):
-            valid = log.valid[seed].ravel()
-
-            def flat(leaf: np.ndarray, seed: int = seed, valid: np.ndarray = valid) -> np.ndarray:
-                return leaf[seed].ravel()[valid]
-
-            option, length, ended = flat(log.option), flat(log.steps), flat(log.episode_ended)
-            calls[seed] = np.bincount(option, minlength=self._options)
-            steps[seed] = np.bincount(option, weights=length, minlength=self._options)
-            decisions_so_far = self._taken[seed, 0] + 1 + np.arange(len(option))
-            steps_so_far = self._taken[seed, 1] + np.cumsum(length)
+            decisions = jax.tree.map(lambda leaf, seed=seed: leaf[seed][log.valid[seed]], log._replace(loss=None))
+            calls[seed] = np.bincount(decisions.option, minlength=self._options)
+            steps[seed] = np.bincount(decisions.option, weights=decisions.steps, minlength=self._options)
             columns = (
-                decisions_so_far,
-                steps_so_far,
-                flat(log.episode_return),
-                flat(log.episode_steps),
-                flat(log.episode_decisions),
-                flat(log.terminated),
+                self._taken[seed, 0] + 1 + np.arange(len(decisions.option)),
+                self._taken[seed, 1] + np.cumsum(decisions.steps),
+                decisions.episode_return,
+                decisions.episode_steps,
+                decisions.episode_decisions,
+                decisions.terminated,
             )
+            ended = decisions.episode_ended
             self._episodes[seed].append(np.stack([column[ended].astype(np.float64) for column in columns]))
-            self._taken[seed] += (len(option), int(length.sum()))
-        self.usage.append(Usage(self._taken[:, 0].copy(), calls, steps, log.loss.mean(axis=1), chunk.seconds))
+            self._taken[seed] += (len(decisions.option), int(decisions.steps.sum()))
+        self.usage.append(
+            Usage(self._taken[:, 0].copy(), calls, steps, np.asarray(log.loss).mean(axis=1), chunk.seconds)
+        )
 
     def episodes(self, seed: int) -> Episodes:
         """The finished episodes of the seed with this position."""

@@ -1,0 +1,52 @@
+"""The names that most programs on top of Lodestone need, in one place."""
+
+from lodestone.agents.dqn import DQNConfig
+from lodestone.agents.playing import Playback, play, record
+from lodestone.agents.pretraining import as_options, pretrain
+from lodestone.agents.q_learning import QLearningConfig
+from lodestone.agents.saved import Policy, load_options, load_policy, save_options, save_policy
+from lodestone.agents.training import train_policy
+from lodestone.devices import use_all_cores
+from lodestone.envs.base import Environment
+from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
+from lodestone.envs.task import Task
+from lodestone.errors import LodestoneError
+from lodestone.learning.networks import NetworkConfig
+from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.catalogue import scripted_options
+from lodestone.options.execution import Rules
+from lodestone.options.scripted import Script, Scripted
+from lodestone.planning.solve import optimum
+
+__all__ = [
+    "Capped",
+    "DQNConfig",
+    "Environment",
+    "LodestoneError",
+    "MagnetArm",
+    "NetworkConfig",
+    "Options",
+    "Playback",
+    "Policy",
+    "Primitives",
+    "QLearningConfig",
+    "Rules",
+    "Script",
+    "Scripted",
+    "Task",
+    "Union",
+    "as_options",
+    "go_down_task",
+    "lift_task",
+    "load_options",
+    "load_policy",
+    "optimum",
+    "play",
+    "pretrain",
+    "record",
+    "save_options",
+    "save_policy",
+    "scripted_options",
+    "train_policy",
+    "use_all_cores",
+]

@@ -1,0 +1,76 @@
+"""What Q-learning over options learns, against the planner's table."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from corridor import Corridor
+
+from lodestone.agents.q_learning import QLearningConfig, q_learning
+from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.learning.loop import train
+from lodestone.options.base import Capped, Primitives, Union
+from lodestone.options.catalogue import scripted_options
+from lodestone.options.execution import Rules
+from lodestone.planning.option_models import option_value_iteration, tabulate_options
+from lodestone.planning.tables import tabulate
+
+
+@pytest.mark.parametrize("undiscounted", [False, True])
+def test_learned_values_equal_the_planners(undiscounted):
+    """Where the optimal policy goes; elsewhere exploration may not have come often enough."""
+    arm = MagnetArm(rows=3, columns=3, bricks=2, tower_height=2)
+    options = Union((Primitives(arm.action_names), Capped(scripted_options(arm, ("go-down", "lift")), 21)))
+    rules = Rules(decision_limit=100, undiscounted_option_reward=undiscounted)
+    algorithm = q_learning(QLearningConfig(epsilon=((0.0, 1.0), (1.0, 0.3))), arm, options, rules, 100_000)
+    for carry, _ in train(algorithm, [0], 100_000, 100_000):
+        learned = np.asarray(carry.table[0])
+    tables = tabulate(arm)
+    exact = option_value_iteration(
+        tables, tabulate_options(options, tables.space), 0.99, undiscounted_option_reward=undiscounted
+    ).option_values
+    np.testing.assert_allclose(learned[0][np.isfinite(exact[0])], exact[0][np.isfinite(exact[0])], atol=1e-2)
+    visited = (learned != 0) & np.isfinite(exact)
+    assert visited.mean() > 0.5
+    assert np.median(np.abs(learned - exact)[visited]) < 1e-3
+
+
+class Still(Corridor):
+    """One state for ever."""
+
+    def transition(self, state, action, outcome):
+        return state
+
+    def terminal(self, state):
+        return jnp.bool_(False)
+
+
+def test_a_time_limit_bootstraps_unless_it_is_taken_for_an_end():
+    """Reward 1 for ever: V = 1 / (1 - 0.9) = 10. Where every tenth step, a limit, is taken for an end, V solves
+    V = 1 + 0.9 * 0.9 V."""
+    still = Still(length=2, step_reward=1.0)
+    options = Primitives(still.action_names)
+    found = {}
+    for bootstrap in (True, False):
+        rules = Rules(discount=0.9, step_limit=10, bootstrap_at_limit=bootstrap)
+        config = QLearningConfig(learning_rate=((0.0, 0.5), (0.3, 0.002)))
+        algorithm = q_learning(config, still, options, rules, 20_000)
+        for carry, _ in train(algorithm, [0], 20_000, 20_000):
+            found[bootstrap] = float(jnp.max(carry.table))
+    assert found[True] == pytest.approx(10.0, abs=1e-2)
+    assert found[False] == pytest.approx(1 / (1 - 0.81), abs=0.2)
+
+
+def test_options_of_one_step_are_q_learning():
+    """Primitives behind a cap, in a union, are the same learner as the primitives alone: the same random numbers give
+    the same table."""
+    corridor = Corridor(length=6)
+    plain = Primitives(corridor.action_names)
+    tables = []
+    for options in (plain, Union((Capped(plain, 1),))):
+        algorithm = q_learning(QLearningConfig(), corridor, options, Rules(step_limit=20), 2000)
+        for carry, _ in train(algorithm, [0, 1], 2000, 2000):
+            tables.append(np.asarray(carry.table))
+    np.testing.assert_array_equal(*tables)
+    assert tables[0].any()

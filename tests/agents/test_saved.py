@@ -1,0 +1,169 @@
+"""Files: what is saved comes back; what is damaged or foreign is refused in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from lodestone.agents.saved import Policy, load_options, load_policy, save_options, save_policy
+from lodestone.envs.base import example_state
+from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.state_space import reachable_states
+from lodestone.errors import BadFile
+from lodestone.files import read_arrays, write_arrays
+from lodestone.learning.networks import NetworkConfig, init_q_network
+from lodestone.options.base import Capped, Primitives, Union
+from lodestone.options.catalogue import scripted_options, tasks
+from lodestone.options.execution import Rules
+from lodestone.options.networks import NetworkOptions
+from lodestone.options.tabular import as_tabular
+
+ARM = MagnetArm()
+SMALL = NetworkConfig(kernels=(3,), strides=(3,), channels=(4,), hidden=(8,))
+
+
+def networks(count: int, outputs: int):
+    keys = jax.random.split(jax.random.key(0), count)
+    return jax.vmap(lambda key: init_q_network(SMALL, (12, 9, 3), outputs, key))(keys)
+
+
+def every_kind() -> Union:
+    """One set with every kind of options in it, under different names."""
+    learned = NetworkOptions(tasks(ARM), networks(2, 6))
+    tables = as_tabular(Primitives(tuple(f"table {name}" for name in ARM.action_names)), reachable_states(ARM))
+    return Union((Primitives(ARM.action_names), Capped(learned, 21), tables))
+
+
+@pytest.fixture
+def policy() -> Policy:
+    return Policy("dqn", ARM, every_kind(), Rules(decision_limit=50), networks(3, 14), 0.1, (4, 5, 6))
+
+
+def test_a_policy_comes_back_whole(policy, tmp_path):
+    save_policy(tmp_path / "policy.safetensors", policy)
+    found = load_policy(tmp_path / "policy.safetensors")
+    assert (found.agent, found.environment, found.rules, found.seeds) == ("dqn", ARM, policy.rules, (4, 5, 6))
+    assert found.options.names == policy.options.names
+    assert found.options.max_steps == policy.options.max_steps
+    for state_number in (0, 17, 155):
+        state = reachable_states(ARM).state(state_number)
+        for name in ("initiation", "action_probs", "termination"):
+            np.testing.assert_array_equal(getattr(found.options, name)(state), getattr(policy.options, name)(state))
+        for position in range(3):
+            np.testing.assert_array_equal(found.values(position)(state), policy.values(position)(state))
+
+
+def test_a_table_comes_back(tmp_path):
+    table = jax.random.normal(jax.random.key(1), (2, 156, 6))
+    policy = Policy("q-learning", ARM, Primitives(ARM.action_names), Rules(), table, 1.0, (0, 1))
+    save_policy(tmp_path / "policy.safetensors", policy)
+    found = load_policy(tmp_path / "policy.safetensors")
+    np.testing.assert_array_equal(found.values(1)(example_state(ARM)), table[1, 0])
+
+
+def test_values_are_in_units_of_the_environments_reward(policy):
+    state = example_state(ARM)
+    network = jax.tree.map(lambda leaf: leaf[0], policy.learned)
+    np.testing.assert_allclose(policy.values(0)(state), network(ARM.observe(state)) / 0.1, rtol=1e-5)
+
+
+def test_scripted_options_come_back(tmp_path):
+    options = scripted_options(ARM, ["lift"])
+    save_options(tmp_path / "options.safetensors", options, ARM)
+    assert load_options(tmp_path / "options.safetensors", ARM) == options
+
+
+def test_options_for_another_shape_are_refused(tmp_path):
+    save_options(tmp_path / "options.safetensors", NetworkOptions(tasks(ARM), networks(2, 6)), ARM)
+    with pytest.raises(BadFile, match=r"needs float32 \[2, 768, 8\]"):
+        load_options(tmp_path / "options.safetensors", MagnetArm(rows=6, columns=4, bricks=4, tower_height=4))
+
+
+def test_a_file_of_another_kind_is_refused(policy, tmp_path):
+    save_policy(tmp_path / "policy.safetensors", policy)
+    with pytest.raises(BadFile, match="holds policy, but options were expected"):
+        load_options(tmp_path / "policy.safetensors", ARM)
+
+
+def test_every_truncation_is_refused(policy, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy)
+    whole = path.read_bytes()
+    for length in [0, 1, 7, 8, 9, 100, 1000, *range(2000, len(whole), 5003), len(whole) - 1]:
+        path.write_bytes(whole[:length])
+        with pytest.raises(BadFile):
+            load_policy(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"hello", b"\x80\x04K\x01.", b"\xff" * 64, b"{}", b"PK\x03\x04" + bytes(60)])
+def test_foreign_files_are_refused(content, tmp_path):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(BadFile, match="truncated, or no safetensors"):
+        load_policy(tmp_path / "file")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(BadFile, match="nowhere"):
+        load_policy(tmp_path / "nowhere.safetensors")
+
+
+HOSTILE = [
+    ("environment", {"name": "__import__('os')", "parameters": {}}),
+    ("environment", {"name": "magnet-arm", "parameters": {"rows": 10**9}}),
+    ("environment", {"name": "magnet-arm", "parameters": {"rows": "4"}}),
+    ("environment", {"name": "magnet-arm", "parameters": {"unknown": 1}}),
+    ("environment", None),
+    ("options", {"kind": "eval", "code": "1"}),
+    ("options", {"kind": "capped", "cap": 0, "options": {"kind": "primitives"}}),
+    ("options", {"kind": "union", "parts": []}),
+    ("options", {"kind": "scripted", "names": ["no such option"]}),
+    ("options", []),
+    ("rules", {"discount": 7}),
+    ("rules", {"surprise": 1}),
+    ("seeds", ["x"]),
+    ("seeds", 3),
+    ("reward_scale", "much"),
+    ("network", {"kernels": [3], "strides": [0], "channels": [4], "hidden": [8]}),
+    ("network", {"kernels": [3, 3], "strides": [3], "channels": [4], "hidden": [8]}),
+    ("network", "big"),
+    ("kind", 5),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), HOSTILE)
+def test_hostile_recipes_are_refused(key, value, policy, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy)
+    arrays, header = read_arrays(path)
+    write_arrays(path, arrays, header | {key: value})
+    with pytest.raises(BadFile):
+        load_policy(path)
+
+
+def test_a_missing_array_or_key_is_refused(policy, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy)
+    arrays, header = read_arrays(path)
+    for name in list(arrays)[:3]:
+        write_arrays(path, {other: array for other, array in arrays.items() if other != name}, header)
+        with pytest.raises(BadFile, match="missing"):
+            load_policy(path)
+    for name in header:
+        write_arrays(path, arrays, {other: value for other, value in header.items() if other != name})
+        if name not in ("version",):
+            with pytest.raises(BadFile):
+                load_policy(path)
+
+
+def test_nothing_is_left_half_written(policy, tmp_path: Path, monkeypatch):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy)
+    before = path.read_bytes()
+    monkeypatch.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(Exception, match="No space left"):
+        save_policy(path, policy)
+    assert path.read_bytes() == before
+    assert [one.name for one in tmp_path.iterdir()] == ["policy.safetensors"]

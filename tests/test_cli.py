@@ -1,0 +1,148 @@
+"""The command line as a program: what it prints, what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lodestone import __version__
+from lodestone.cli import main
+
+TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
+SMALL = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32", "--learning-starts", "100"]
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error."""
+    try:
+        code = main(words)
+    except SystemExit as leaving:
+        code = int(leaving.code or 0)
+    output = capsys.readouterr()
+    return code, output.out, output.err
+
+
+def test_plan_prints_one_json_object(capsys):
+    code, out, _ = run(capsys, "plan", "magnet-arm", "--json", "--options", "go-down", "lift")
+    found = json.loads(out)
+    assert code == 0
+    assert (found["states"], found["optimal_steps"], found["optimal_return"]) == (156, 13, 87)
+    assert found["discounted_value"] == pytest.approx(76.39059, abs=1e-4)
+    assert found["optimal_decisions"] == 7
+
+
+def test_plan_prints_a_table(capsys):
+    code, out, _ = run(capsys, "plan", "magnet-arm", *TINY)
+    assert code == 0
+    assert "optimal steps" in out
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A short run with options."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    words = ["train", "dqn", "magnet-arm", *TINY, *SMALL, "--steps", "900", "--seeds", "2", "--seed", "7"]
+    assert main([*words, "--options", "go-down", "lift", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_train_leaves_a_run_folder(trained):
+    config = json.loads((trained / "config.json").read_text())
+    assert config["seeds"] == [7, 8]
+    assert config["environment"]["parameters"]["rows"] == 3
+    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    assert {line["seed"] for line in lines} == {7, 8}
+    last = lines[-1]
+    assert last["steps"] >= 900
+    assert sum(last["calls"].values()) > 0
+    assert sorted(path.name for path in trained.iterdir()) == ["config.json", "metrics.jsonl", "policy.safetensors"]
+
+
+def test_watch_plays_in_a_pipe_and_writes_pictures(trained, capsys, tmp_path):
+    code, out, _ = run(capsys, "watch", str(trained))
+    assert code == 0
+    assert "step   1:" in out
+    code, out, _ = run(capsys, "watch", str(trained), "--position", "1", "--gif", str(tmp_path / "new" / "a.gif"))
+    assert code == 0
+    assert (tmp_path / "new" / "a.gif").read_bytes()[:3] == b"GIF"
+    code, out, _ = run(capsys, "watch", str(trained / "policy.safetensors"), "--html", str(tmp_path / "a.html"))
+    assert code == 0
+    assert "<html" in (tmp_path / "a.html").read_text()
+
+
+def test_train_prints_json_and_writes_nothing_without_out(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(capsys, "train", "q-learning", "magnet-arm", *TINY, "--steps", "3000", "--seed", "3", "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert found["seeds"][0]["seed"] == 3
+    assert found["seeds"][0]["steps"] >= 2900
+    assert found["optimal_return"] > 0
+    assert list(tmp_path.iterdir()) == []
+
+
+REFUSED = [
+    (["nonsense"], "no command named 'nonsense'"),
+    (["plan"], "needs the name of an environment"),
+    (["plan", "moon"], "no environment named 'moon'"),
+    (["train", "sarsa", "magnet-arm"], "no agent named 'sarsa'"),
+    (["train", "dqn"], "needs the name of an environment"),
+    (["plan", "magnet-arm", "--bricks", "99"], "99 bricks do not fit"),
+    (["plan", "magnet-arm", "--tower-height", "4"], "allow a tower of at most"),
+    (["plan", "magnet-arm", "--rows", "0"], "rows is 0"),
+    (["plan", "magnet-arm", "--columns", "-2"], "columns is -2"),
+    (["plan", "magnet-arm", "--discount", "1.5"], "discount is 1.5"),
+    (["plan", "magnet-arm", "--options", "fly"], "no option named 'fly'"),
+    (["train", "dqn", "magnet-arm", "--learning-rate", "0", "nan"], "learning_rate"),
+    (["train", "dqn", "magnet-arm", "--learning-rate", "0", "inf"], "learning_rate"),
+    (["train", "dqn", "magnet-arm", "--options", "fly"], "no option named 'fly'"),
+    (["train", "dqn", "magnet-arm", "--options", "missing.safetensors"], "missing.safetensors"),
+    (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),
+    (["train", "dqn", "magnet-arm", "--seeds", "0"], "seeds is 0"),
+    (["train", "dqn", "magnet-arm", "--no-primitives"], "at least one option"),
+    (["train", "dqn", "magnet-arm", "--no-primitives", "--options", "lift"], "No option may start"),
+    (["reproduce", "--preset", "slow"], "slow"),
+    (["reproduce", "--figure", "4"], "4"),
+    (["reproduce", "--seeds", "0"], "seeds is 0"),
+    (["watch", "nowhere"], "nowhere"),
+]
+
+
+@pytest.mark.parametrize(("words", "sentence"), REFUSED)
+def test_bad_input_is_refused_in_a_sentence(words, sentence, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, *words)
+    assert code == 2
+    assert sentence in " ".join(err.replace("│", " ").split())
+    assert "Traceback" not in err
+    assert out == ""
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_an_output_folder_that_cannot_be_written_is_refused(capsys, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for words in (["train", "dqn", "magnet-arm"], ["reproduce"]):
+        code, _, err = run(capsys, *words, "--out", str(tmp_path / "file" / "run"))
+        assert code == 2
+        assert "cannot be written" in err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_run_is_not_overwritten(trained, capsys):
+    before = (trained / "config.json").read_bytes()
+    code, _, err = run(capsys, "train", "dqn", "magnet-arm", "--out", str(trained))
+    assert code == 2
+    assert "holds a run already" in err
+    assert (trained / "config.json").read_bytes() == before
+
+
+def test_help_and_version(capsys):
+    code, out, _ = run(capsys)
+    assert code == 0
+    assert "reproduce" in out
+    assert run(capsys, "--version")[1] == f"lodestone {__version__}\n"
+    code, out, _ = run(capsys, "train", "dqn", "magnet-arm", "--help")
+    assert code == 0
+    assert "--tower-height" in out
