@@ -350,8 +350,7 @@ def _pretrain(settings: Pretrain) -> None:
             progress.begin(task.name, 1.0)
 
             def tell(taken: int, judgement: Any) -> None:
-                text = f"success {judgement.success:.0%}, mean length {judgement.mean_steps:.2f}"
-                progress.advance(taken / settings.decisions, text)
+                progress.advance(taken / settings.decisions, str(judgement))
 
             pretrained.append(
                 pretrain(

@@ -60,7 +60,7 @@ class ConsoleProgress:
             self._console.print(f"{done / self._total:4.0%}  {self._stage}  {left}  {text}", highlight=False)
 
     def _time_left(self, done: float) -> str:
-        if done <= 0:
+        if done < 0.02 * self._total:
             return "estimating"
         seconds = (monotonic() - self._started) * (self._total / done - 1)
         minutes, rest = divmod(int(seconds), 60)

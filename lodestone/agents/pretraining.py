@@ -38,6 +38,10 @@ class Judgement:
     starts: int
     """Number of starts."""
 
+    def __str__(self) -> str:
+        length = f", mean length {self.mean_steps:.2f}" if self.success else ""
+        return f"success {self.success:.0%}{length}"
+
 
 @dataclass(frozen=True)
 class Pretrained:

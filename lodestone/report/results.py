@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lodestone.experiments.comparison import AgentRun, Comparison, Gate
+from lodestone.files import json_safe
 from lodestone.learning.history import Episodes, first_above
 from lodestone.report.statistics import estimate
 
