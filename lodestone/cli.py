@@ -292,7 +292,7 @@ def _train(train: Train, agent: str) -> None:
         best = optimum(environment)
     except TooManyStates:
         best = None
-    greedy = [play(policy, position, jax.random.key(seed)) for position, seed in enumerate(seeds)]
+    greedy = play(policy, jax.random.key(0))
     content: dict[str, Any] = {
         "agent": agent,
         "environment": describe_environment(environment),
@@ -304,11 +304,11 @@ def _train(train: Train, agent: str) -> None:
                 "decisions": history.taken(position)[0],
                 "steps": history.taken(position)[1],
                 "episodes": len(history.episodes(position).total_reward),
-                "greedy_return": float(greedy[position].total_reward),
-                "greedy_steps": int(greedy[position].steps),
-                "greedy_decisions": int(greedy[position].decisions),
-                "success": bool(greedy[position].success),
-                "gap": best.optimal_return - float(greedy[position].total_reward) if best else None,
+                "greedy_return": float(greedy.total_reward[position]),
+                "greedy_steps": int(greedy.steps[position]),
+                "greedy_decisions": int(greedy.decisions[position]),
+                "success": bool(greedy.success[position]),
+                "gap": best.optimal_return - float(greedy.total_reward[position]) if best else None,
             }
             for position, seed in enumerate(seeds)
         ],
@@ -397,7 +397,7 @@ def _watch(watch: Watch) -> None:
         raise InvalidConfig(
             f"position is {watch.position}, but {path} holds {len(policy.seeds)} seeds, counted from 0."
         )
-    playback = record(policy, watch.position, jax.random.key(policy.seeds[watch.position]), policy.agent)
+    playback = record(policy, watch.position, jax.random.key(0), policy.agent)
     for target, write in ((watch.gif, animation.write_gif), (watch.html, html.write_player)):
         if target is not None:
             prepare_folder(target.parent)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.saved import Policy
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
@@ -38,21 +38,22 @@ class Playback:
     """Return so far, after each step."""
 
 
-def play(policy: Policy, position: int, key: PRNGKeyArray) -> Episode:
-    """One greedy episode of the seed at this position."""
-    values = policy.values(position)
+def play(policy: Policy, key: PRNGKeyArray) -> Episode:
+    """One greedy episode of every seed, all with the same key; leaves have a leading seed axis."""
 
     @jax.jit
-    def run(key: PRNGKeyArray) -> Episode:
+    @jax.vmap
+    def run(learned: PyTree) -> Episode:
+        values = policy.values_of(learned)
         return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
 
-    return jax.tree.map(np.asarray, run(key))
+    return jax.tree.map(np.asarray, run(policy.learned))
 
 
 def record(policy: Policy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
     """One greedy episode of the seed at this position, with its pictures."""
     values = policy.values(position)
-    length = int(play(policy, position, key).steps)
+    length = int(play(policy, key).steps[position])
 
     @jax.jit
     def run(key: PRNGKeyArray) -> Trace:

@@ -52,7 +52,10 @@ class Policy:
 
     def values(self, position: int) -> Callable[[State], Float[Array, " O"]]:
         """Q(s, .) of the seed at this position, in units of the environment's reward."""
-        learned = jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.learned)
+        return self.values_of(jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.learned))
+
+    def values_of(self, learned: QNetwork | Float[Array, "S O"]) -> Callable[[State], Float[Array, " O"]]:
+        """The same of what one seed has learned."""
         if isinstance(learned, QNetwork):
             return lambda state: learned(self.environment.observe(state)) / self.reward_scale
         space = reachable_states(self.environment)

@@ -10,7 +10,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.learning.collecting import no_decisions
 from lodestone.learning.replay import add, empty_replay, sample
+from lodestone.options.base import Primitives, Union
+from lodestone.options.catalogue import scripted_options
 from lodestone.types import Transition
 
 OPTIONS = 3
@@ -50,3 +54,12 @@ def test_samples_uniformly_from_what_is_held():
     values, counts = np.unique(drawn, return_counts=True)
     assert values.tolist() == [10, 12, 13, 14]
     assert np.abs(counts - 2000).max() < 4 * np.sqrt(8000 * 0.25 * 0.75)
+
+
+def test_a_million_transitions_of_the_larger_arm_take_less_than_100_megabytes():
+    arm = MagnetArm(rows=6, columns=4, bricks=4, tower_height=4)
+    options = Union((Primitives(arm.action_names), scripted_options(arm, ("go-down", "lift"))))
+    example = jax.eval_shape(lambda: jax.tree.map(lambda leaf: leaf[0], no_decisions(arm, options, 1).transition))
+    shapes = jax.eval_shape(lambda one: empty_replay(one, 1_000_000), example)
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+    assert size < 100e6
