@@ -142,7 +142,8 @@ def update(
         learner.network, learner.target, batch, config.double, config.reward_scale
     )
     gradient = jax.tree.map(lambda leaf: _clip(leaf, config.max_gradient_norm), gradient)
-    direction, adam = optax.scale_by_adam(eps=config.adam_epsilon).update(gradient, learner.adam)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to an integer power, which strictness forbids
+        direction, adam = optax.scale_by_adam(eps=config.adam_epsilon).update(gradient, learner.adam)
     network = jax.tree.map(lambda old, step: old - learning_rate * step, learner.network, direction)
     return learner._replace(network=network, adam=adam), value / config.batch_size
 

@@ -76,7 +76,7 @@ def q_learning(
         return Carry(table, start_actors(environment, actor_key, 1), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
-        fraction = number.astype(jnp.float32) / steps
+        fraction = number.astype(jnp.float32) / jnp.float32(steps)
         tick_key, key = jax.random.split(carry.key)
         epsilon = piecewise_linear(config.epsilon, fraction)
 

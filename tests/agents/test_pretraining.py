@@ -26,12 +26,13 @@ def always(action: int):
     )
 
 
-def test_going_down_always_is_optimal_for_going_down_and_never_lifts():
+def test_always_down_goes_down_and_never_lifts():
     task = go_down_task(ARM)
     judgement = judge(task, always(DOWN), cap=21)
     assert judgement.success == 1.0
     assert judgement.starts == 21
-    assert judgement.mean_steps == pytest.approx(optimum(task).optimal_steps)
+    assert judgement.mean_steps == pytest.approx(2.0)
+    assert optimum(task).optimal_steps == pytest.approx(1.82716, abs=1e-5)  # a step to a taller tower is shorter
     assert judge(lift_task(ARM), always(DOWN), cap=21).success == 0.0
     assert judge(task, always(DOWN), cap=1).success < 1.0
 
