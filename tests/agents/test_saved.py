@@ -78,7 +78,7 @@ def test_scripted_options_come_back(tmp_path):
 
 def test_options_for_another_shape_are_refused(tmp_path):
     save_options(tmp_path / "options.safetensors", NetworkOptions(tasks(ARM), networks(2, 6)), ARM)
-    with pytest.raises(BadFile, match=r"needs float32 \[2, 768, 8\]"):
+    with pytest.raises(BadFile, match=r"needs float32 \[2, 96, 8\]"):
         load_options(tmp_path / "options.safetensors", MagnetArm(rows=6, columns=4, bricks=4, tower_height=4))
 
 
