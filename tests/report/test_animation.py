@@ -3,7 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake import make_playback
+from fake_comparison import make_playback
 from PIL import Image
 
 from lodestone.report.animation import STRIP, write_gif

@@ -4,7 +4,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from fake import make_comparison, make_episodes
+from fake_comparison import make_comparison, make_episodes
 from matplotlib.axes import Axes
 from PIL import Image
 

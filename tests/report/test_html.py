@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake import GATES, SETTINGS, make_comparison, make_playback
+from fake_comparison import GATES, SETTINGS, make_comparison, make_playback
 
 from lodestone.experiments.comparison import Comparison, Gate
 from lodestone.report.html import write_player, write_report

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from fake import GATES, SETTINGS, make_comparison
+from fake_comparison import GATES, SETTINGS, make_comparison
 
 from lodestone.errors import CannotWrite
 from lodestone.files import json_safe, write_json

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from fake import seeds_that_differ
+from fake_comparison import seeds_that_differ
 from scipy import stats
 
 from lodestone.report.statistics import estimate, interquartile_mean
