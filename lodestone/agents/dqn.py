@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -46,6 +47,8 @@ class DQNConfig:
     """Every weight and bias array's gradient is scaled down to this norm."""
     batch_size: int = 32
     """Transitions per update; the loss is their summed Huber loss."""
+    huber_delta: float = 1.0
+    """Scaled error up to which the loss is quadratic, and beyond which it is linear."""
     replay_capacity: int = 1_000_000
     """Transitions kept; no more memory is taken than the run can fill."""
     learning_starts: int = 1000
@@ -82,7 +85,7 @@ class DQNConfig:
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
         if self.learning_starts < 0:
             raise InvalidConfig(f"learning_starts is {self.learning_starts}, but must not be negative.")
-        for name in ("adam_epsilon", "max_gradient_norm", "reward_scale"):
+        for name in ("adam_epsilon", "huber_delta", "max_gradient_norm", "reward_scale"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be a positive number.")
         if self.decisions_per_round + self.environments - 1 > self.replay_capacity:
@@ -108,11 +111,11 @@ class Carry(NamedTuple):
     key: PRNGKeyArray
 
 
-def loss(network: QNetwork, target: QNetwork, batch: Transition, double: bool, reward_scale: float) -> Float[Array, ""]:
+def loss(config: DQNConfig, network: QNetwork, target: QNetwork, batch: Transition) -> Float[Array, ""]:
     """Huber loss, summed over the batch, of Q(s, o) against the semi-Markov target."""
-    rewards = batch.reward * reward_scale
+    rewards = batch.reward * config.reward_scale
     next_values = jax.vmap(target)(batch.next_obs)
-    if double:
+    if config.double:
         preferences = jax.vmap(network)(batch.next_obs)
         targets = jax.vmap(double_semi_markov_target)(
             rewards, batch.discount, next_values, preferences, batch.next_available
@@ -121,7 +124,7 @@ def loss(network: QNetwork, target: QNetwork, batch: Transition, double: bool, r
         targets = jax.vmap(semi_markov_target)(rewards, batch.discount, next_values, batch.next_available)
     values = jax.vmap(network)(batch.obs)
     chosen = jnp.take_along_axis(values, batch.action[:, None], axis=1)[:, 0]
-    return jnp.sum(optax.huber_loss(chosen, jax.lax.stop_gradient(targets), delta=1.0))
+    return jnp.sum(optax.huber_loss(chosen, jax.lax.stop_gradient(targets), delta=config.huber_delta))
 
 
 def update(
@@ -138,9 +141,7 @@ def update(
     batch = sample(learner.replay, bits)
     observe = jax.vmap(environment.observe)
     batch = batch._replace(obs=observe(batch.obs), next_obs=observe(batch.next_obs))
-    value, gradient = jax.value_and_grad(loss)(
-        learner.network, learner.target, batch, config.double, config.reward_scale
-    )
+    value, gradient = jax.value_and_grad(partial(loss, config))(learner.network, learner.target, batch)
     gradient = jax.tree.map(lambda leaf: _clip(leaf, config.max_gradient_norm), gradient)
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to an integer power, which strictness forbids
         direction, adam = optax.scale_by_adam(eps=config.adam_epsilon).update(gradient, learner.adam)

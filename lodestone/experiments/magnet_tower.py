@@ -6,8 +6,8 @@ beside the exact optimum.
 
 The preset `paper` is the authors' protocol: their network, optimiser, schedules and limits, plain option rewards, time
 limits stored as ends. The preset `fast` is our tuning of the same algorithms: a network whose first layer fits the
-picture's cells, several environments per seed, double Q-learning, discounted option rewards, scaled rewards, time
-limits that bootstrap.
+picture's cells, several environments per seed, a longer random phase, a smaller discount, a quadratic loss, double
+Q-learning, discounted option rewards, scaled rewards, time limits that bootstrap.
 """
 
 from __future__ import annotations
@@ -93,26 +93,40 @@ def settings(figure: str, preset: str) -> Settings:
 
 
 def _fast(figure: str) -> tuple[dict[str, Training], dict[str, Training]]:
-    """Both learners and both figures share what is not said otherwise here."""
-    channels = 16 if figure == "2" else 32
-    network = NetworkConfig(kernels=(3,), strides=(3,), channels=(channels,), hidden=(128,))
-    agent = DQNConfig(
-        network=network,
+    """Both learners first act at random, until success by chance has been seen several times: a random episode of 200
+    decisions builds the tower on 4x3 with probability 0.03, with options 0.24; on 6x4 with 0.00003, with options 0.02.
+    The discount of 0.97 makes the best action stand out more from the second best than 0.99 does."""
+    task = DQNConfig(
+        network=NetworkConfig(kernels=(3,), strides=(3,), channels=(32,), hidden=(128,)),
         reward_scale=0.1,
         learning_rate=((0.0, 1e-3), (0.5, 1e-3), (1.0, 5e-5)),
-        epsilon=((0.0, 1.0), (0.08, 0.1), (1.0, 0.05)),
+        epsilon=((0.0, 1.0), (0.4, 0.1)),
     )
-    task = replace(agent, network=replace(network, channels=(32,)), epsilon=((0.0, 1.0), (0.4, 0.1)))
+    agent = replace(
+        task,
+        network=replace(task.network, channels=(16,)),
+        reward_scale=0.2,
+        huber_delta=20.0,
+        max_gradient_norm=1000.0,
+        learning_rate=((0.0, 1e-3), (0.6, 1e-3), (1.0, 1e-5)),
+    )
     if figure == "2":
-        budgets, decisions = {"go-down": 10_000, "lift": 20_000}, 60_000
+        budgets, decisions = {"go-down": 10_000, "lift": 20_000}, 100_000
+        agent = replace(agent, updates_per_round=16)
+        agents = {
+            WITH_OPTIONS: replace(agent, learning_starts=4000, epsilon=((0.05, 1.0), (0.15, 0.1))),
+            FLAT: replace(agent, learning_starts=30_000, epsilon=((0.4, 1.0), (0.7, 0.1))),
+        }
     else:
         # Lifting is found by chance, and seldom: more decisions for each update.
         task = replace(task, environments=32, decisions_per_round=32)
-        budgets, decisions = {"go-down": 60_000, "lift": 160_000}, 80_000
-    task_rules, rules = Rules(step_limit=100), Rules(decision_limit=200)
+        budgets, decisions = {"go-down": 60_000, "lift": 160_000}, 150_000
+        agent = replace(agent, learning_starts=30_000, epsilon=((0.27, 1.0), (0.55, 0.1)))
+        agents = {WITH_OPTIONS: agent, FLAT: agent}
+    task_rules, rules = Rules(step_limit=100), Rules(discount=0.97, decision_limit=200)
     return (
         {name: Training(task, task_rules, budget) for name, budget in budgets.items()},
-        {name: Training(agent, rules, decisions) for name in (WITH_OPTIONS, FLAT)},
+        {name: Training(config, rules, decisions) for name, config in agents.items()},
     )
 
 

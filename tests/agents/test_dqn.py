@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,8 +46,8 @@ def numpy_q(network, x: np.ndarray) -> np.ndarray:
     return x @ np.asarray(network.layers[-1].weight) + np.asarray(network.layers[-1].bias)
 
 
-@pytest.mark.parametrize("double", [False, True])
-def test_loss_equals_a_plain_numpy_loop(double):
+@pytest.mark.parametrize(("double", "delta"), [(False, 1.0), (True, 1.0), (True, 0.3)])
+def test_loss_equals_a_plain_numpy_loop(double, delta):
     batch = random_batch(20)
     network = init_q_network(SMALL, (5,), 3, jax.random.key(0))
     target = init_q_network(SMALL, (5,), 3, jax.random.key(1))
@@ -59,8 +61,8 @@ def test_loss_equals_a_plain_numpy_loop(double):
             judge = numpy_q(network, one.next_obs) if double else later
             wanted += one.discount * later[usable[np.argmax(judge[usable])]]
         error = abs(wanted - numpy_q(network, one.obs)[one.action])
-        total += 0.5 * error**2 if error <= 1 else error - 0.5
-    found = loss(network, target, batch, double, 0.5)
+        total += 0.5 * error**2 if error <= delta else delta * (error - 0.5 * delta)
+    found = loss(DQNConfig(double=double, reward_scale=0.5, huber_delta=delta), network, target, batch)
     assert float(found) == pytest.approx(total, rel=1e-5)
 
 
@@ -76,7 +78,7 @@ def test_gradient_of_a_one_hot_linear_network_is_the_tabular_update(reward, slop
         next_obs=jnp.eye(5)[3:4],
         next_available=jnp.ones((1, 3), dtype=bool),
     )
-    gradient = jax.grad(loss)(network, network, batch, False, 1.0)
+    gradient = jax.grad(partial(loss, DQNConfig()))(network, network, batch)
     wanted = np.zeros((5, 3))
     wanted[2, 1] = -slope
     np.testing.assert_allclose(gradient.layers[0].weight, wanted, atol=1e-6)
@@ -143,6 +145,7 @@ def test_an_exploding_loss_stops_the_run_with_advice():
         {"epsilon": ((0.0, 1.5),)},
         {"batch_size": 0},
         {"reward_scale": 0.0},
+        {"huber_delta": 0.0},
         {"learning_starts": -1},
         {"replay_capacity": 3},
     ],

@@ -34,7 +34,7 @@ def test_the_paper_preset_is_the_authors_protocol(figure, decisions):
             (decisions // 8, 5e-5),
         ]
         assert not config.double
-        assert config.reward_scale == 1
+        assert config.reward_scale == config.huber_delta == 1
         assert (config.network.kernels, config.network.strides) == ((8, 4, 3), (4, 2, 1))
         assert (config.network.channels, config.network.hidden) == ((32, 64, 64), (256,))
     epsilon = [(round(time * 500_000), value) for time, value in settings("3", "paper").agents[FLAT].config.epsilon]
@@ -90,7 +90,7 @@ def test_a_tiny_run_fills_the_folder(tmp_path):
 def test_work_counts_updates():
     chosen = tiny()
     work = total_work([chosen], seeds=3)
-    assert work == pytest.approx(2 * 2 * 2000 + 2 * 3 * 2000)
+    assert work == pytest.approx(2 * 2 * 2000 + 2 * 3 * 2 * 2000)
 
 
 @pytest.mark.slow
