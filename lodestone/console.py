@@ -20,6 +20,9 @@ class ConsoleProgress:
         self._total = total
         self._done_before = 0.0
         self._stage_work = 0.0
+        self._stage_done = 0.0
+        self._skipped = 0.0
+        """Work of stages that ended before their time; it says nothing about the speed."""
         self._stage = ""
         self._started = monotonic()
         self._last_line = -SECONDS_BETWEEN_LINES
@@ -46,22 +49,27 @@ class ConsoleProgress:
     def begin(self, stage: str, work: float) -> None:
         """A stage begins, with so much work ahead."""
         self._done_before += self._stage_work
+        self._skipped += self._stage_work - self._stage_done
         self._stage, self._stage_work = stage, work
         self.advance(0.0, "compiling")
 
     def advance(self, work: float, text: str) -> None:
         """So much of the stage's work has been done in all."""
+        self._stage_done = work
         done = self._done_before + work
         left = self._time_left(done)
         self._bar.update(self._task, completed=done, description=self._stage, text=text, left=left)
         now = monotonic()
         if not self._console.is_terminal and (work == 0 or now - self._last_line >= SECONDS_BETWEEN_LINES):
             self._last_line = now
-            self._console.print(f"{done / self._total:4.0%}  {self._stage}  {left}  {text}", highlight=False)
+            self._console.print(
+                f"{done / self._total:4.0%}  {self._stage}  {left}  {text}", highlight=False, soft_wrap=True
+            )
 
     def _time_left(self, done: float) -> str:
-        if done < 0.02 * self._total:
+        worked = done - self._skipped
+        if worked < 0.02 * self._total:
             return "estimating"
-        seconds = (monotonic() - self._started) * (self._total / done - 1)
+        seconds = (monotonic() - self._started) * (self._total - done) / worked
         minutes, rest = divmod(int(seconds), 60)
         return f"about {minutes}:{rest:02d} left"
