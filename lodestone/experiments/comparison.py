@@ -51,6 +51,7 @@ class OptionRun:
     """Share of the starts from which the task is completed."""
     mean_steps: float
     optimal_mean_steps: float
+    """Of the policy with the best return, which may charge for more than time."""
     starts: int
     decisions: int
     seconds: float

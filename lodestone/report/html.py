@@ -194,11 +194,12 @@ def _pretraining(options: Sequence[OptionRun]) -> str:
         )
         cells = "".join(f'<td class="number">{number}</td>' for number in numbers)
         rows.append(f'<tr><th scope="row">{escape(option.name)}</th>{cells}</tr>')
-    head = _head("option", ("success", "mean steps", "optimal mean steps", "starts", "training decisions", "seconds"))
+    columns = ("success", "mean steps", "best policy's mean steps", "starts", "training decisions", "seconds")
+    head = _head("option", columns)
     return (
         '<div class="card">\n<h3>Pretraining of the options</h3>\n<p class="muted">Judged from every start of the '
-        f'option\'s task, beside the exact optimum.</p>\n<div class="scroll"><table>{head}<tbody>\n{_lines(rows)}'
-        "</tbody></table></div>\n</div>"
+        "option's task, beside the policy with the best possible return.</p>\n"
+        f'<div class="scroll"><table>{head}<tbody>\n{_lines(rows)}</tbody></table></div>\n</div>'
     )
 
 

@@ -90,7 +90,7 @@ def test_a_tiny_run_fills_the_folder(tmp_path):
 def test_work_counts_updates():
     chosen = tiny()
     work = total_work([chosen], seeds=3)
-    assert work == pytest.approx(2 * 2 * 2000 + 2 * 3 * 2 * 2000)
+    assert work == pytest.approx(2 * 2 * 2000 + 2 * 3 * 2000)
 
 
 @pytest.mark.slow
