@@ -12,3 +12,9 @@ gymnasium.register(
     vector_entry_point="lodestone.envs.gymnasium:make_vector",
     kwargs={"environment": "magnet-arm", "step_limit": 200},
 )
+gymnasium.register(
+    id="lodestone/FourRooms-v0",
+    entry_point="lodestone.envs.gymnasium:make",
+    vector_entry_point="lodestone.envs.gymnasium:make_vector",
+    kwargs={"environment": "four-rooms", "step_limit": 1000},
+)

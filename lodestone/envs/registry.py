@@ -6,10 +6,11 @@ import dataclasses
 from typing import Any
 
 from lodestone.envs.base import Environment
+from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.errors import UnknownName, check_name
 
-ENVIRONMENTS: dict[str, type[Environment]] = {"magnet-arm": MagnetArm}
+ENVIRONMENTS: dict[str, type[Environment]] = {"magnet-arm": MagnetArm, "four-rooms": FourRooms}
 """Every environment, by name."""
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lodestone.envs.base import Environment, example_state, sample_initial, sample_step
+from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.registry import ENVIRONMENTS
 from lodestone.envs.state_space import reachable_states
@@ -18,6 +19,9 @@ CASES = {
     "magnet-arm, index": MagnetArm(observation="index"),
     "magnet-arm, go down": go_down_task(MagnetArm()),
     "magnet-arm, lift": lift_task(MagnetArm()),
+    "four-rooms, deterministic": FourRooms("deterministic"),
+    "four-rooms, text": FourRooms("text", goal=0),
+    "four-rooms, code": FourRooms("code", observation="cell"),
 }
 
 
