@@ -41,4 +41,5 @@ class Diverged(LodestoneError):
 def check_name(kind: str, name: str, known: tuple[str, ...]) -> None:
     """Raise `UnknownName` unless `name` is one of `known`."""
     if name not in known:
-        raise UnknownName(f"There is no {kind} named {name!r}; there are: {', '.join(known)}.")
+        others = f"there are: {', '.join(known)}" if known else "there are none here"
+        raise UnknownName(f"There is no {kind} named {name!r}; {others}.")

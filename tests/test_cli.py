@@ -33,6 +33,14 @@ def test_plan_prints_one_json_object(capsys):
     assert found["optimal_decisions"] == 7
 
 
+def test_plan_takes_an_environments_parameters(capsys):
+    code, out, _ = run(capsys, "plan", "four-rooms", "--dynamics", "code", "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert found["parameters"]["dynamics"] == "code"
+    assert found["optimal_steps"] == pytest.approx(8.3924, abs=1e-4)
+
+
 def test_plan_prints_a_table(capsys):
     code, out, _ = run(capsys, "plan", "magnet-arm", *TINY)
     assert code == 0
@@ -98,6 +106,8 @@ REFUSED = [
     (["train", "dqn", "magnet-arm", "--learning-rate", "0", "nan"], "learning_rate"),
     (["train", "dqn", "magnet-arm", "--learning-rate", "0", "inf"], "learning_rate"),
     (["train", "dqn", "magnet-arm", "--options", "fly"], "no option named 'fly'"),
+    (["train", "dqn", "four-rooms", "--options", "fly"], "no option named 'fly'; there are none here"),
+    (["plan", "four-rooms", "--goal", "104"], "goal is 104"),
     (["train", "dqn", "magnet-arm", "--options", "missing.safetensors"], "missing.safetensors"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),
     (["train", "dqn", "magnet-arm", "--seeds", "0"], "seeds is 0"),

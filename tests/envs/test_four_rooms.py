@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import lodestone  # noqa: F401 (registers the environments)
 from lodestone.envs.four_rooms import CELLS, FREE, HALLWAYS, NUMBER, OPEN, PALETTE, FourRooms, RoomState
 from lodestone.errors import InvalidConfig
-from lodestone.planning.solve import optimum
+from lodestone.planning.solve import expected_steps, optimum
 from lodestone.planning.tables import tabulate
 
 DYNAMICS = ("deterministic", "sps", "text", "code")
@@ -50,8 +50,6 @@ def test_the_optimum_from_a_uniform_start(dynamics, steps, value):
     ("dynamics", "steps"), [("deterministic", 502.44), ("sps", 502.44), ("text", 459.40), ("code", 430.23)]
 )
 def test_a_random_walk_takes_a_known_time(dynamics, steps):
-    from lodestone.planning.solve import expected_steps
-
     tables = tabulate(FourRooms(dynamics=dynamics))
     uniform = np.full((tables.num_states, 4), 0.25)
     assert tables.initial_mean(expected_steps(tables, uniform)) == pytest.approx(steps, abs=0.01)
