@@ -16,6 +16,7 @@ from lodestone.learning.networks import NetworkConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
 from lodestone.options.catalogue import scripted_options
 from lodestone.options.execution import Rules
+from lodestone.options.four_rooms import hallway_options
 from lodestone.options.scripted import Script, Scripted
 from lodestone.planning.solve import optimum
 
@@ -39,6 +40,7 @@ __all__ = [
     "Union",
     "as_options",
     "go_down_task",
+    "hallway_options",
     "lift_task",
     "load_options",
     "load_policy",

@@ -1,0 +1,82 @@
+"""The hallway options of Four Rooms (Sutton, Precup and Singh 1999, section 5).
+
+Each takes the agent out of a room by one of its two hallways. It is given where to get; how, is the exact optimum of a
+problem of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+
+from lodestone.envs.four_rooms import CELLS, HALLWAYS, NUMBER, SQUARES, FourRooms
+from lodestone.options.base import NO_CAP
+from lodestone.options.tabular import TabularOptions
+from lodestone.planning.solve import optimal_choices, value_iteration
+from lodestone.planning.tables import Tables, tabulate
+
+DOORS = dict(zip(("north", "west", "east", "south"), (int(NUMBER[hallway]) for hallway in HALLWAYS), strict=True))
+"""The cell of each hallway."""
+
+ROOMS = {
+    "north-west": ((1, 1), (5, 5), ("north", "west")),
+    "north-east": ((1, 7), (6, 11), ("north", "east")),
+    "south-west": ((7, 1), (11, 5), ("west", "south")),
+    "south-east": ((8, 7), (11, 11), ("east", "south")),
+}
+"""First and last square of each room, and its two hallways."""
+
+
+def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
+    """Eight options, one for each hallway of each room.
+
+    An option may start anywhere in its room and in the room's other hallway; it stops outside the room and at the goal.
+    Its policy has the highest expected discount^k for the k steps to its hallway, where leaving the cells in which it
+    may start by any other way is worth 0. Of equally good actions the first is taken.
+    """
+    names, may_start, policies, goes_on = [], [], [], []
+    for room, (first, last, doors) in ROOMS.items():
+        inside = np.all((first <= SQUARES) & (last >= SQUARES), axis=1)
+        for door, other in (doors, doors[::-1]):
+            starts = inside | (np.arange(CELLS) == DOORS[other])
+            names.append(f"{room}-to-{door}")
+            may_start.append(starts)
+            policies.append(_policy(rooms, DOORS[door], starts, discount))
+            goes_on.append(inside & (np.arange(CELLS) != rooms.goal))
+    space = tabulate(rooms).space
+    cell = np.asarray(space.states.cell)
+    return TabularOptions(
+        space,
+        tuple(names),
+        (NO_CAP,) * len(names),
+        initiation_table=jnp.asarray(np.stack(may_start, axis=1)[cell]),
+        policy_table=jnp.asarray(np.eye(rooms.num_actions, dtype=np.float32)[np.stack(policies, axis=1)[cell]]),
+        termination_table=jnp.asarray(~np.stack(goes_on, axis=1)[cell], dtype=jnp.float32),
+    )
+
+
+def _policy(
+    rooms: FourRooms, door: int, region: Bool[np.ndarray, " cells"], discount: float
+) -> Int[np.ndarray, " cells"]:
+    """The best action of each cell in the house whose goal is the door and where leaving the region is the end."""
+    tables = tabulate(dataclasses.replace(rooms, goal=door, goal_reward=1.0, step_reward=0.0))
+    cell = np.asarray(tables.space.states.cell)
+    problem = _ended_outside(tables, (region | (np.arange(CELLS) == door))[cell])
+    action_values = value_iteration(problem, discount).action_values
+    policy = np.zeros(CELLS, dtype=np.int64)
+    policy[cell] = optimal_choices(action_values).argmax(axis=1)
+    return policy
+
+
+def _ended_outside(tables: Tables, region: Bool[np.ndarray, " S"]) -> Tables:
+    """The same process, ended for nothing by leaving the region."""
+    stays = np.arange(tables.num_states)[:, None, None]
+    inside = region[:, None, None]
+    return tables._replace(
+        successors=np.where(inside, tables.successors, stays).astype(tables.successors.dtype),
+        rewards=np.where(inside, tables.rewards, 0.0),
+        terminal=tables.terminal | ~region,
+    )
