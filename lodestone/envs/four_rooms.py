@@ -16,9 +16,8 @@ from PIL import Image, ImageDraw
 from lodestone.envs.base import Environment
 from lodestone.errors import InvalidConfig
 
-UP, DOWN, LEFT, RIGHT = range(4)
 STEPS = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)])
-"""Row and column by which each action moves."""
+"""Row and column by which each action moves: up, down, left, right."""
 
 HALLWAYS = ((3, 6), (6, 2), (7, 9), (10, 6))
 """Row and column of each hallway."""

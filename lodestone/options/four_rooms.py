@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from lodestone.envs.four_rooms import CELLS, HALLWAYS, NUMBER, SQUARES, FourRooms
+from lodestone.envs.state_space import reachable_states
 from lodestone.options.base import NO_CAP
 from lodestone.options.tabular import TabularOptions
 from lodestone.planning.solve import optimal_choices, value_iteration
@@ -46,7 +47,7 @@ def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
             may_start.append(starts)
             policies.append(_policy(rooms, DOORS[door], starts, discount))
             goes_on.append(inside & (np.arange(CELLS) != rooms.goal))
-    space = tabulate(rooms).space
+    space = reachable_states(rooms)
     cell = np.asarray(space.states.cell)
     return TabularOptions(
         space,

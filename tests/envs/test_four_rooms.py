@@ -15,8 +15,6 @@ from lodestone.errors import InvalidConfig
 from lodestone.planning.solve import expected_steps, optimum
 from lodestone.planning.tables import tabulate
 
-DYNAMICS = ("deterministic", "sps", "text", "code")
-
 
 def test_the_house_has_104_cells_and_known_hallways():
     assert CELLS == 104
