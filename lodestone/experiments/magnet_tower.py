@@ -58,7 +58,7 @@ class Training:
 
     @property
     def work(self) -> float:
-        """Updates of one seed: what the time goes into."""
+        """Updates of one seed, as if there were no random phase before the first: what the time goes into."""
         return self.decisions / self.config.decisions_per_round * self.config.updates_per_round
 
 
