@@ -11,6 +11,7 @@ from lodestone.envs.base import Environment
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.task import Task
+from lodestone.envs.taxi import Taxi
 from lodestone.errors import LodestoneError
 from lodestone.learning.networks import NetworkConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
@@ -37,6 +38,7 @@ __all__ = [
     "Script",
     "Scripted",
     "Task",
+    "Taxi",
     "Union",
     "as_options",
     "go_down_task",

@@ -8,9 +8,14 @@ from typing import Any
 from lodestone.envs.base import Environment
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.taxi import Taxi
 from lodestone.errors import UnknownName, check_name
 
-ENVIRONMENTS: dict[str, type[Environment]] = {"magnet-arm": MagnetArm, "four-rooms": FourRooms}
+ENVIRONMENTS: dict[str, type[Environment]] = {
+    "magnet-arm": MagnetArm,
+    "four-rooms": FourRooms,
+    "taxi": Taxi,
+}
 """Every environment, by name."""
 
 

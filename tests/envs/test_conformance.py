@@ -11,6 +11,7 @@ from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.registry import ENVIRONMENTS
 from lodestone.envs.state_space import reachable_states
+from lodestone.envs.taxi import Taxi
 from lodestone.types import State
 
 CASES = {
@@ -22,6 +23,8 @@ CASES = {
     "four-rooms, deterministic": FourRooms("deterministic"),
     "four-rooms, text": FourRooms("text", goal=0),
     "four-rooms, code": FourRooms("code", observation="cell"),
+    "taxi, all of its chance": Taxi("jair", move_success=0.8, fickle=0.3),
+    "taxi, index": Taxi(fickle=0.3, starts="any", observation="index"),
 }
 
 
