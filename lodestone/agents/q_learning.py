@@ -15,15 +15,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.envs.base import Environment
-from lodestone.envs.state_space import StateSpace, reachable_states
-from lodestone.learning.collecting import start_actors, tick_all
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import semi_markov_target
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Decision, Rules
-from lodestone.types import State
+from lodestone.options.execution import Actor, Chance, Decision, Rules, start_actor, tick
+from lodestone.options.tabular import on_numbers
+from lodestone.planning.enumerated import enumerated
+from lodestone.planning.tables import tabulate
+
+STEPS_PER_ROUND = 32
+"""Primitive steps between two looks at the schedules."""
 
 
 @dataclass(frozen=True)
@@ -45,50 +48,56 @@ class Carry(NamedTuple):
 
     table: Float[Array, "S O"]
     """Q; starts at zero as in the paper, which is optimistic where steps cost."""
-    actors: Actor
-    """One actor, with a leading axis of one."""
+    actor: Actor
     key: PRNGKeyArray
 
 
 def update(
-    table: Float[Array, "S O"], space: StateSpace, decision: Decision, learning_rate: Float[Array, ""]
+    table: Float[Array, "S O"], decision: Decision, learning_rate: Float[Array, ""]
 ) -> tuple[Float[Array, "S O"], Float[Array, ""]]:
-    """One update from one decision; none where the decision is not valid. Returns the squared error, too."""
+    """One update from one decision between numbered states; none where the decision is not valid. Returns the squared
+    error, too."""
     transition = decision.transition
-    state, next_state = space.index_of(transition.obs), space.index_of(transition.next_obs)
-    target = semi_markov_target(transition.reward, transition.discount, table[next_state], transition.next_available)
-    error = jnp.where(decision.valid, target - table[state, transition.action], 0.0)
-    return table.at[state, transition.action].add(learning_rate * error), jnp.square(error)
+    next_values = table[transition.next_obs]
+    target = semi_markov_target(transition.reward, transition.discount, next_values, transition.next_available)
+    error = jnp.where(decision.valid, target - table[transition.obs, transition.action], 0.0)
+    return table.at[transition.obs, transition.action].add(learning_rate * error), jnp.square(error)
 
 
 def q_learning(
     config: QLearningConfig, environment: Environment, options: Options, rules: Rules, steps: int
 ) -> Algorithm:
-    """The algorithm for the training loop. A round is one primitive step; schedules are fractions of `steps`.
+    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
+    `steps`.
 
-    Raises `TooManyStates` where the table would be too large.
+    Raises `TooManyStates` where the tables would be too large.
     """
-    space = reachable_states(environment)
+    tables = tabulate(environment)
+    world = enumerated(tables, environment.action_names)
+    numbered = on_numbers(options, tables.space)
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        table = jnp.zeros((space.size, options.size))
-        return Carry(table, start_actors(environment, actor_key, 1), key)
+        return Carry(jnp.zeros((tables.num_states, options.size)), start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
-        fraction = number.astype(jnp.float32) / jnp.float32(steps)
-        tick_key, key = jax.random.split(carry.key)
+        """`STEPS_PER_ROUND` primitive steps, each with an update if a decision ends on it."""
+        fraction = number.astype(jnp.float32) * (STEPS_PER_ROUND / steps)
         epsilon = piecewise_linear(config.epsilon, fraction)
-
-        def choose(uniform: Float[Array, "1 2"], states: State) -> Int[Array, " 1"]:
-            state = jax.tree.map(lambda leaf: leaf[0], states)
-            values = carry.table[space.index_of(state)]
-            return epsilon_greedy(uniform[0], values, options.initiation(state), epsilon)[None]
-
-        actors, decisions = tick_all(environment, options, rules, tick_key, carry.actors, choose)
-        decision = jax.tree.map(lambda leaf: leaf[0], decisions)
         learning_rate = piecewise_linear(config.learning_rate, fraction)
-        table, loss = update(carry.table, space, decision, learning_rate)
-        return Carry(table, actors, key), log_round(decisions, loss)
+        noise_key, key = jax.random.split(carry.key)
+
+        def step(carry: tuple[Array, Actor], noise: Float[Array, "6"]) -> tuple[tuple[Array, Actor], tuple]:
+            table, actor = carry
+            available = numbered.initiation(actor.state)
+            choice = epsilon_greedy(noise[:2], table[actor.state], available, epsilon)
+            actor, decision = tick(world, numbered, rules, Chance(*noise[2:]), actor, choice)
+            table, loss = update(table, decision, learning_rate)
+            return (table, actor), (decision, loss)
+
+        # Random numbers are drawn for all steps together: one by one they would take longer than the steps.
+        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + len(Chance._fields)))
+        (table, actor), (decisions, losses) = jax.lax.scan(step, (carry.table, carry.actor), noise)
+        return Carry(table, actor, key), log_round(decisions, jnp.mean(losses))
 
     return Algorithm(init, run_round)

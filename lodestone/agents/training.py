@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lodestone.agents.dqn import DQNConfig, dqn
-from lodestone.agents.q_learning import QLearningConfig, q_learning
+from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.saved import Policy
 from lodestone.envs.base import Environment
 from lodestone.learning.history import History
@@ -45,7 +45,7 @@ def train_policy(
             name, scale, rounds = "dqn", config.reward_scale, config.rounds(length)
             algorithm = dqn(config, environment, options, rules, length)
         case QLearningConfig():
-            name, scale, rounds = "q-learning", 1.0, length
+            name, scale, rounds = "q-learning", 1.0, -(-length // STEPS_PER_ROUND)
             algorithm = q_learning(config, environment, options, rules, length)
 
     history = History(len(seeds), options.size)

@@ -35,7 +35,7 @@ class Environment(eqx.Module):
 
     @abstractmethod
     def initial_distribution(self) -> tuple[Float[Array, " I"], State]:
-        """Probabilities of the I states in which an episode may begin, and these states, stacked."""
+        """Probabilities, all positive, of the I states in which an episode may begin, and these states, stacked."""
 
     @abstractmethod
     def outcome_probs(self, state: State, action: Int[Array, ""]) -> Float[Array, " K"]:
@@ -90,22 +90,34 @@ def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Arra
     return inverse_cdf(probs, jax.random.uniform(key))
 
 
-def sample_initial(environment: Environment, key: PRNGKeyArray) -> State:
-    """The first state of an episode."""
+def initial_state(environment: Environment, uniform: Float[Array, ""]) -> State:
+    """The first state of an episode that a uniform number in [0, 1) picks."""
     probs, states = environment.initial_distribution()
     if probs.shape[0] == 1:
         return jax.tree.map(lambda leaf: leaf[0], states)
-    index = sample_categorical(key, probs)
+    # There may be hundreds of states to begin in: a search by halves.
+    edges = jnp.cumsum(probs)
+    index = jnp.searchsorted(edges, uniform * edges[-1], side="right", method="scan_unrolled")
     return jax.tree.map(lambda leaf: leaf[index], states)
 
 
-def sample_step(environment: Environment, key: PRNGKeyArray, state: State, action: Int[Array, ""]) -> Step:
-    """One primitive step: nature draws, the state moves, the reward is paid."""
+def next_step(environment: Environment, uniform: Float[Array, ""], state: State, action: Int[Array, ""]) -> Step:
+    """One primitive step: a uniform number in [0, 1) picks nature's draw, the state moves, the reward is paid."""
     outcome = jnp.int32(0)
     if environment.num_outcomes > 1:
-        outcome = sample_categorical(key, environment.outcome_probs(state, action))
+        outcome = inverse_cdf(environment.outcome_probs(state, action), uniform)
     next_state = environment.transition(state, action, outcome)
     return Step(next_state, environment.reward(state, action, next_state), environment.terminal(next_state))
+
+
+def sample_initial(environment: Environment, key: PRNGKeyArray) -> State:
+    """The first state of an episode, at random."""
+    return initial_state(environment, jax.random.uniform(key))
+
+
+def sample_step(environment: Environment, key: PRNGKeyArray, state: State, action: Int[Array, ""]) -> Step:
+    """One primitive step, at random."""
+    return next_step(environment, jax.random.uniform(key), state, action)
 
 
 def example_state(environment: Environment) -> State:

@@ -67,6 +67,17 @@ class StateSpace(eqx.Module):
         return jax.tree.map(lambda leaf: jnp.asarray(leaf)[index], self.states)
 
 
+class Numbers(eqx.Module):
+    """The numbering of states that are numbers already."""
+
+    size: int = eqx.field(static=True)
+    """S."""
+
+    def index_of(self, state: Int[Array, ""]) -> Int[Array, ""]:
+        """The state itself."""
+        return state
+
+
 def _words(state: State) -> UInt32[Array, " words"]:
     """One state's bits as 32-bit words, one word per element."""
     leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(state)]

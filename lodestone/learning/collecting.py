@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.envs.base import Environment, example_state
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Decision, Rules, start_actor, tick
+from lodestone.options.execution import Actor, Decision, Rules, draw_chance, start_actor, tick
 from lodestone.types import State, Transition
 
 Choose = Callable[[Float[Array, "N 2"], State], Int[Array, " N"]]
@@ -29,9 +29,8 @@ def tick_all(
     count = actors.option.shape[0]
     keys = jax.random.split(key, count + 1)
     choices = choose(jax.random.uniform(keys[count], (count, 2)), actors.state)
-    return jax.vmap(tick, in_axes=(None, None, None, 0, 0, 0))(
-        environment, options, rules, keys[:count], actors, choices
-    )
+    chance = jax.vmap(draw_chance)(keys[:count])
+    return jax.vmap(tick, in_axes=(None, None, None, 0, 0, 0))(environment, options, rules, chance, actors, choices)
 
 
 def collect(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lodestone.envs.base import Environment
 from lodestone.learning.policies import greedy
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Rules, start_actor, tick
+from lodestone.options.execution import Actor, Rules, draw_chance, start_actor, tick
 from lodestone.types import State
 
 Values = Callable[[State], Float[Array, " O"]]
@@ -62,7 +62,7 @@ def play_episode(
         key, actor, _, _ = carry
         key, tick_key = jax.random.split(key)
         choice = greedy(values(actor.state), options.initiation(actor.state))
-        actor, decision = tick(environment, options, rules, tick_key, actor, choice)
+        actor, decision = tick(environment, options, rules, draw_chance(tick_key), actor, choice)
         episode = Episode(
             decision.episode_return, decision.episode_steps, decision.episode_decisions, decision.terminated
         )
@@ -83,7 +83,9 @@ def trace_episode(
         actor, live, key = carry
         key, tick_key = jax.random.split(key)
         state_values, available = values(actor.state), options.initiation(actor.state)
-        next_actor, decision = tick(environment, options, rules, tick_key, actor, greedy(state_values, available))
+        next_actor, decision = tick(
+            environment, options, rules, draw_chance(tick_key), actor, greedy(state_values, available)
+        )
         trace = Trace(
             live=live,
             state=actor.state,

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, inverse_cdf, sample_initial, sample_step
+from lodestone.envs.base import Environment, initial_state, inverse_cdf, next_step, sample_initial
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import Options
 from lodestone.types import State, Transition
@@ -105,11 +105,30 @@ def start_actor(environment: Environment, key: PRNGKeyArray) -> Actor:
     )
 
 
+class Chance(NamedTuple):
+    """The random numbers of one tick, uniform in [0, 1)."""
+
+    action: Float[Array, ""]
+    """Picks the action under an option that draws it."""
+    termination: Float[Array, ""]
+    outcome: Float[Array, ""]
+    """Nature's."""
+    restart: Float[Array, ""]
+    """Picks the next episode's first state."""
+
+
+def draw_chance(key: PRNGKeyArray) -> Chance:
+    """The random numbers of one tick. Those of the environment are only computed where it needs them."""
+    action, termination = jax.random.uniform(key, (2,))
+    outcome, restart = (jax.random.uniform(jax.random.fold_in(key, number)) for number in (0, 1))
+    return Chance(action, termination, outcome, restart)
+
+
 def tick(
     environment: Environment,
     options: Options,
     rules: Rules,
-    key: PRNGKeyArray,
+    chance: Chance,
     actor: Actor,
     choice: Int[Array, ""],
 ) -> tuple[Actor, Decision]:
@@ -117,17 +136,14 @@ def tick(
 
     The environment restarts by itself after an episode's end; `Decision.transition.next_obs` is the state before that.
     """
-    # Random numbers cost much in so small a program: the keys below are hashed only if the environment needs them.
-    uniform = jax.random.uniform(key, (2,))
-    outcome_key, reset_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
     fresh = actor.deciding
     option = jnp.where(fresh, choice, actor.option)
     start = _select(fresh, actor.state, actor.start)
     reward_before = jnp.where(fresh, 0.0, actor.reward)
     discount_before = jnp.where(fresh, 1.0, actor.discount)
 
-    action = inverse_cdf(options.action_probs(actor.state)[option], uniform[0])
-    state, reward, terminated = sample_step(environment, outcome_key, actor.state, action)
+    action = inverse_cdf(options.action_probs(actor.state)[option], chance.action)
+    state, reward, terminated = next_step(environment, chance.outcome, actor.state, action)
 
     elapsed = jnp.where(fresh, 0, actor.elapsed) + 1
     caps = jnp.asarray(options.max_steps, dtype=jnp.int32)
@@ -139,7 +155,7 @@ def tick(
     episode_decisions = actor.episode_decisions + fresh.astype(jnp.int32)
 
     beta = options.termination(state)[option]
-    stops = (uniform[1] < beta) | (elapsed >= caps[option])
+    stops = (chance.termination < beta) | (elapsed >= caps[option])
     truncated = jnp.bool_(False)
     if rules.step_limit is not None:
         truncated |= episode_steps >= rules.step_limit
@@ -174,7 +190,7 @@ def tick(
 
     over = terminated | truncated
     next_actor = Actor(
-        state=_select(over, sample_initial(environment, reset_key), state),
+        state=_select(over, initial_state(environment, chance.restart), state),
         deciding=ended,
         start=start,
         option=option,

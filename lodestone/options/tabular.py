@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lodestone.envs.state_space import StateSpace
+from lodestone.envs.state_space import Numbers, StateSpace
 from lodestone.options.base import Options
 from lodestone.planning.option_models import tabulate_options
 from lodestone.types import State
@@ -15,7 +15,7 @@ from lodestone.types import State
 class TabularOptions(Options):
     """O options over S states."""
 
-    space: StateSpace
+    space: StateSpace | Numbers
     option_names: tuple[str, ...] = eqx.field(static=True)
     caps: tuple[int, ...] = eqx.field(static=True)
     initiation_table: Bool[Array, "S O"]
@@ -42,9 +42,18 @@ class TabularOptions(Options):
 
 def as_tabular(options: Options, space: StateSpace) -> TabularOptions:
     """The same options as tables over `space`: equal in every state of it, and as cheap as a look-up."""
+    return _from_tables(space, options, space)
+
+
+def on_numbers(options: Options, space: StateSpace) -> TabularOptions:
+    """The same options where a state is given as its number in `space`, as in an `Enumerated` environment."""
+    return _from_tables(Numbers(space.size), options, space)
+
+
+def _from_tables(numbering: StateSpace | Numbers, options: Options, space: StateSpace) -> TabularOptions:
     tables = tabulate_options(options, space)
     return TabularOptions(
-        space,
+        numbering,
         tables.names,
         tables.max_steps,
         initiation_table=jnp.asarray(tables.initiation.T),

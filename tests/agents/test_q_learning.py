@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from corridor import Corridor
 
-from lodestone.agents.q_learning import QLearningConfig, q_learning
+from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.learning.loop import train
 from lodestone.options.base import Capped, Primitives, Union
@@ -24,7 +24,7 @@ def test_learned_values_equal_the_planners(undiscounted):
     options = Union((Primitives(arm.action_names), Capped(scripted_options(arm, ("go-down", "lift")), 21)))
     rules = Rules(decision_limit=100, undiscounted_option_reward=undiscounted)
     algorithm = q_learning(QLearningConfig(epsilon=((0.0, 1.0), (1.0, 0.3))), arm, options, rules, 100_000)
-    for carry, _ in train(algorithm, [0], 100_000, 100_000):
+    for carry, _ in train(algorithm, [0], 100_000 // STEPS_PER_ROUND, 100_000):
         learned = np.asarray(carry.table[0])
     tables = tabulate(arm)
     exact = option_value_iteration(
@@ -56,7 +56,7 @@ def test_a_time_limit_bootstraps_unless_it_is_taken_for_an_end():
         rules = Rules(discount=0.9, step_limit=10, bootstrap_at_limit=bootstrap)
         config = QLearningConfig(learning_rate=((0.0, 0.5), (0.3, 0.002)))
         algorithm = q_learning(config, still, options, rules, 20_000)
-        for carry, _ in train(algorithm, [0], 20_000, 20_000):
+        for carry, _ in train(algorithm, [0], 20_000 // STEPS_PER_ROUND, 20_000):
             found[bootstrap] = float(jnp.max(carry.table))
     assert found[True] == pytest.approx(10.0, abs=1e-2)
     assert found[False] == pytest.approx(1 / (1 - 0.81), abs=0.2)
@@ -70,7 +70,7 @@ def test_options_of_one_step_are_q_learning():
     tables = []
     for options in (plain, Union((Capped(plain, 1),))):
         algorithm = q_learning(QLearningConfig(), corridor, options, Rules(step_limit=20), 2000)
-        for carry, _ in train(algorithm, [0, 1], 2000, 2000):
+        for carry, _ in train(algorithm, [0, 1], 2000 // STEPS_PER_ROUND, 2000):
             tables.append(np.asarray(carry.table))
     np.testing.assert_array_equal(*tables)
     assert tables[0].any()

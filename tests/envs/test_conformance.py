@@ -56,7 +56,7 @@ def test_initial_probabilities_sum_to_one(environment: Environment) -> None:
     probs, starts = environment.initial_distribution()
     assert {leaf.shape[0] for leaf in jax.tree.leaves(starts)} == {len(probs)}
     assert float(jnp.sum(probs)) == pytest.approx(1, abs=1e-5)
-    assert bool(jnp.all(probs >= 0))
+    assert bool(jnp.all(probs > 0))
 
 
 def test_outcome_probabilities_sum_to_one(environment: Environment, states: State) -> None:

@@ -10,7 +10,7 @@ from corridor import LEFT, RIGHT, Corridor, Walk
 
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
-from lodestone.options.execution import Decision, Rules, start_actor, tick
+from lodestone.options.execution import Decision, Rules, draw_chance, start_actor, tick
 
 GAMMA = 0.9
 WALK = 2
@@ -26,7 +26,7 @@ def play_options(corridor: Corridor, options: Options, rules: Rules, choices: li
     @jax.jit
     def run(choices):
         def step(actor, choice):
-            return tick(corridor, options, rules, jax.random.key(1), actor, choice)
+            return tick(corridor, options, rules, draw_chance(jax.random.key(1)), actor, choice)
 
         return jax.lax.scan(step, start_actor(corridor, jax.random.key(0)), choices)[1]
 
@@ -118,7 +118,7 @@ def test_termination_is_a_probability():
     def first_end(key):
         """Whether the option stops on its first step."""
         actor = start_actor(corridor, key)
-        return tick(corridor, options, Rules(), key, actor, jnp.int32(WALK))[1].valid
+        return tick(corridor, options, Rules(), draw_chance(key), actor, jnp.int32(WALK))[1].valid
 
     stops = np.asarray(first_end(jax.random.split(jax.random.key(3), 4000)))
     assert abs(stops.mean() - 0.25) < 4 * np.sqrt(0.25 * 0.75 / 4000)

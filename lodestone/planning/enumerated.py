@@ -1,0 +1,72 @@
+"""An environment of numbered states, whose dynamics are look-ups: what a tabular learner runs on.
+
+The same process as the environment that it was made from, state for state, at a cost that does not depend on how that
+one computes its transitions.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from lodestone.envs.base import Environment
+from lodestone.planning.tables import Tables
+from lodestone.types import Observation
+
+
+class Enumerated(Environment):
+    """The process of some tables; its state is the number of a state there."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    initial_probs: Float[np.ndarray, " I"]
+    initial_states: Int[np.ndarray, " I"]
+    successors: Int[Array, "S A K"]
+    probs: Float[Array, "S A K"]
+    rewards: Float[Array, "S A K"]
+    ends: Bool[Array, " S"]
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        return self.names
+
+    @property
+    def num_outcomes(self) -> int:
+        return self.successors.shape[2]
+
+    def initial_distribution(self) -> tuple[Float[Array, " I"], Int[Array, " I"]]:
+        return jnp.asarray(self.initial_probs), jnp.asarray(self.initial_states)
+
+    def outcome_probs(self, state: Int[Array, ""], action: Int[Array, ""]) -> Float[Array, " K"]:
+        return self.probs[state, action]
+
+    def transition(self, state: Int[Array, ""], action: Int[Array, ""], outcome: Int[Array, ""]) -> Int[Array, ""]:
+        return self.successors[state, action, outcome]
+
+    def reward(self, state: Int[Array, ""], action: Int[Array, ""], next_state: Int[Array, ""]) -> Float[Array, ""]:
+        """All of nature's draws that lead to the same state pay the same."""
+        return self.rewards[state, action, jnp.argmax(self.successors[state, action] == next_state)]
+
+    def terminal(self, state: Int[Array, ""]) -> Bool[Array, ""]:
+        return self.ends[state]
+
+    def observe(self, state: Int[Array, ""]) -> Observation:
+        return state
+
+    def render(self, state: Int[Array, ""]) -> UInt8[np.ndarray, "height width 3"]:
+        raise NotImplementedError("A numbered state has no picture; render the state of the environment behind it.")
+
+
+def enumerated(tables: Tables, action_names: tuple[str, ...]) -> Enumerated:
+    """The process of `tables`."""
+    initial = np.flatnonzero(tables.initial_probs)
+    return Enumerated(
+        names=action_names,
+        initial_probs=tables.initial_probs[initial].astype(np.float32),
+        initial_states=initial.astype(np.int32),
+        successors=jnp.asarray(tables.successors),
+        probs=jnp.asarray(tables.probs, dtype=jnp.float32),
+        rewards=jnp.asarray(tables.rewards, dtype=jnp.float32),
+        ends=jnp.asarray(tables.terminal),
+    )
