@@ -10,6 +10,7 @@ for _id, _name, _step_limit in (
     ("lodestone/MagnetArm-v0", "magnet-arm", 200),
     ("lodestone/FourRooms-v0", "four-rooms", 1000),
     ("lodestone/Taxi-v0", "taxi", 200),
+    ("lodestone/CorridorMaze-v0", "corridor-maze", 2000),
 ):
     gymnasium.register(
         id=_id,

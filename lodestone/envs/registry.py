@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from lodestone.envs.base import Environment
+from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.taxi import Taxi
@@ -15,6 +16,7 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
     "magnet-arm": MagnetArm,
     "four-rooms": FourRooms,
     "taxi": Taxi,
+    "corridor-maze": CorridorMaze,
 }
 """Every environment, by name."""
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lodestone.envs.base import Environment, example_state, sample_initial, sample_step
+from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.registry import ENVIRONMENTS
@@ -25,6 +26,8 @@ CASES = {
     "four-rooms, code": FourRooms("code", observation="cell"),
     "taxi, all of its chance": Taxi("jair", move_success=0.8, fickle=0.3),
     "taxi, index": Taxi(fickle=0.3, starts="any", observation="index"),
+    "corridor-maze, small": CorridorMaze(2, 3, width=2, length=4, maze_seed=1, observation="cell"),
+    "corridor-maze, deterministic": CorridorMaze(1, 2, move_success=1.0, pixels_per_cell=2),
 }
 
 
