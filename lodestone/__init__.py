@@ -11,6 +11,7 @@ for _id, _name, _step_limit in (
     ("lodestone/FourRooms-v0", "four-rooms", 1000),
     ("lodestone/Taxi-v0", "taxi", 200),
     ("lodestone/CorridorMaze-v0", "corridor-maze", 2000),
+    ("lodestone/TwoRooms-v0", "two-rooms", 100),
 ):
     gymnasium.register(
         id=_id,

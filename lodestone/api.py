@@ -13,6 +13,7 @@ from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.task import Task
 from lodestone.envs.taxi import Taxi
+from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
 from lodestone.learning.networks import NetworkConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
@@ -41,6 +42,7 @@ __all__ = [
     "Scripted",
     "Task",
     "Taxi",
+    "TwoRooms",
     "Union",
     "as_options",
     "go_down_task",

@@ -10,6 +10,7 @@ from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.taxi import Taxi
+from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import UnknownName, check_name
 
 ENVIRONMENTS: dict[str, type[Environment]] = {
@@ -17,6 +18,7 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
     "four-rooms": FourRooms,
     "taxi": Taxi,
     "corridor-maze": CorridorMaze,
+    "two-rooms": TwoRooms,
 }
 """Every environment, by name."""
 

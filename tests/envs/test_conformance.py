@@ -13,6 +13,7 @@ from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.registry import ENVIRONMENTS
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.taxi import Taxi
+from lodestone.envs.two_rooms import TwoRooms
 from lodestone.types import State
 
 CASES = {
@@ -28,6 +29,7 @@ CASES = {
     "taxi, index": Taxi(fickle=0.3, starts="any", observation="index"),
     "corridor-maze, small": CorridorMaze(2, 3, width=2, length=4, maze_seed=1, observation="cell"),
     "corridor-maze, deterministic": CorridorMaze(1, 2, move_success=1.0, pixels_per_cell=2),
+    "two-rooms, cell": TwoRooms(observation="cell"),
 }
 
 
