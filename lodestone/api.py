@@ -8,6 +8,7 @@ from lodestone.agents.saved import Policy, load_options, load_policy, save_optio
 from lodestone.agents.training import train_policy
 from lodestone.devices import use_all_cores
 from lodestone.envs.base import Environment
+from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
@@ -25,6 +26,7 @@ from lodestone.planning.solve import optimum
 
 __all__ = [
     "Capped",
+    "Chain",
     "CorridorMaze",
     "DQNConfig",
     "Environment",

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from lodestone.envs.base import Environment
+from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
@@ -19,6 +20,7 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
     "taxi": Taxi,
     "corridor-maze": CorridorMaze,
     "two-rooms": TwoRooms,
+    "chain": Chain,
 }
 """Every environment, by name."""
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lodestone.envs.base import Environment, example_state, sample_initial, sample_step
+from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
@@ -29,6 +30,7 @@ CASES = {
     "taxi, index": Taxi(fickle=0.3, starts="any", observation="index"),
     "corridor-maze, small": CorridorMaze(2, 3, width=2, length=4, maze_seed=1, observation="cell"),
     "corridor-maze, deterministic": CorridorMaze(1, 2, move_success=1.0, pixels_per_cell=2),
+    "chain, index": Chain(length=4, start=4, right_success=0.8, observation="index"),
     "two-rooms, cell": TwoRooms(observation="cell"),
 }
 
