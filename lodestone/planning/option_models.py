@@ -203,6 +203,34 @@ def evaluate_options(
     return _evaluate(tables, options, policy, rewards, discount)
 
 
+def evaluate_option_choices(
+    tables: Tables,
+    options: OptionTables,
+    policy: Int[np.ndarray, " S"] | Float[np.ndarray, "S O"],
+    discount: float,
+    *,
+    undiscounted_option_reward: bool = False,
+    call_cost: float = 0.0,
+) -> Float[np.ndarray, "S O"]:
+    """Q of a policy over options [S, O]: expected discounted return of running each option first, then the policy.
+
+    As the models, it is defined in every state, also where the option may not start: for an option without a cap it is
+    there what going on with it is worth. With a discount of 1 it is -inf where the option may never stop, or may stop
+    where the policy may go on for ever. The switches, and what is raised, are those of `evaluate_options`.
+    """
+    models = option_models(
+        tables, options, discount, undiscounted_option_reward=undiscounted_option_reward, call_cost=call_cost
+    )
+    rewards = np.stack([model.rewards for model in models], axis=1)
+    values = _evaluate(tables, options, policy, rewards, discount)
+    endless = values == -np.inf
+    after = [
+        np.where(model.backup(endless.astype(np.float64)) > 0, -np.inf, model.backup(np.where(endless, 0.0, values)))
+        for model in models
+    ]
+    return rewards + np.stack(after, axis=1)
+
+
 def expected_option_steps(
     tables: Tables, options: OptionTables, policy: Int[np.ndarray, " S"] | Float[np.ndarray, "S O"]
 ) -> Float[np.ndarray, " S"]:

@@ -26,6 +26,7 @@ from lodestone.options.scripted import Scripted
 from lodestone.planning.option_models import (
     OptionTables,
     check_available,
+    evaluate_option_choices,
     evaluate_options,
     expected_decisions,
     expected_option_steps,
@@ -259,6 +260,23 @@ def test_intra_option_value_iteration_has_the_same_fixed_point(seed: int, goals:
 
 
 @settings(max_examples=30)
+@given(seed=seeds, caps=caps, undiscounted=st.booleans())
+def test_value_iteration_on_dense_models_has_the_same_fixed_point(seed, caps, undiscounted) -> None:
+    """Q(s, o) = R_o(s) + sum_x F_o(s, x) max over available o' of Q(x, o'), with R and F by simulation."""
+    tables, options = random_problem(seed, caps)
+    starts = options.initiation | (np.arange(len(caps))[:, None] == 0)
+    options, live = options._replace(initiation=starts), ~tables.terminal
+    models = [simulated_model(tables, options, one, 0.9, 1.0 if undiscounted else 0.9, 900) for one in range(len(caps))]
+    values = np.zeros(NUM_STATES)
+    for _ in range(400):
+        option_values = np.stack([rewards + ended @ values for rewards, ended in models])
+        values = live * np.where(starts, option_values, -np.inf).max(axis=0)
+    solution = option_value_iteration(tables, options, 0.9, undiscounted_option_reward=undiscounted, tolerance=1e-11)
+    np.testing.assert_allclose(solution.values, values, atol=1e-9)
+    np.testing.assert_allclose(solution.option_values.T[starts & live], option_values[starts & live], atol=1e-9)
+
+
+@settings(max_examples=30)
 @given(seed=seeds, caps=caps)
 def test_random_options_beside_the_primitives_change_no_optimal_value(seed: int, caps: tuple[int, ...]) -> None:
     """Oracle T5; and every switch that is not the definition does change it."""
@@ -292,6 +310,27 @@ def test_policy_over_options_is_worth_what_its_dense_model_says(seed, caps, disc
     expected = np.linalg.solve(np.eye(NUM_STATES) - chain, pay)
     values = evaluate_options(tables, options, policy, discount, undiscounted_option_reward=undiscounted, call_cost=0.1)
     np.testing.assert_allclose(values, expected, atol=1e-9)
+
+
+@settings(max_examples=40)
+@given(seed=seeds, caps=caps, discount=st.sampled_from([0.5, 0.9]), undiscounted=st.booleans())
+def test_each_choice_is_worth_its_dense_model_and_then_the_policy(seed, caps, discount, undiscounted) -> None:
+    """Q [S, O] of a policy, of options that may not start too; its mean under the policy is V."""
+    tables, options = random_problem(seed, caps)
+    options = options._replace(initiation=options.initiation | (np.arange(len(caps))[:, None] == 0))
+    policy = np.random.default_rng(seed).dirichlet(np.ones(len(caps)), size=NUM_STATES) * options.initiation.T
+    policy /= policy.sum(axis=1, keepdims=True)
+    switches = {"undiscounted_option_reward": undiscounted, "call_cost": 0.1}
+    values = evaluate_options(tables, options, policy, discount, **switches)
+    option_values = evaluate_option_choices(tables, options, policy, discount, **switches)
+    for option in range(len(caps)):
+        reward_discount = 1.0 if undiscounted else discount
+        rewards, ended = simulated_model(tables, options, option, discount, reward_discount, horizon=900)
+        rewards = rewards - 0.1 * (caps[option] != 1) * ~tables.terminal
+        np.testing.assert_allclose(option_values[:, option], rewards + ended @ values, atol=1e-9)
+    live = ~tables.terminal
+    np.testing.assert_allclose((policy * option_values).sum(axis=1)[live], values[live], atol=1e-9)
+    np.testing.assert_array_equal(option_values[~live], 0.0)
 
 
 @pytest.mark.parametrize("discount", [0.9, 1.0])
@@ -356,6 +395,16 @@ def test_an_option_that_never_stops_is_worth_minus_infinity_without_a_discount()
     np.testing.assert_allclose(expected_decisions(tables, options, waiting), [np.inf, 1, 0])
     # With a discount it is worth -1 / (1 - 0.9).
     np.testing.assert_allclose(evaluate_options(tables, options, waiting, 0.9), [-10, -1, 0])
+
+
+def test_a_choice_before_a_policy_that_never_ends_is_worth_minus_infinity_without_a_discount() -> None:
+    tables, options = corridor(loops=True)
+    probs, acts = tables.probs.copy(), options.action_probs.copy()
+    probs[1, 0] = [1, 0, 0]  # action 0 leads back from 1 to 0,
+    acts[0, 1] = [1, 0]  # where the option `on` takes it
+    tables, options = tables._replace(probs=probs), options._replace(action_probs=acts)
+    found = evaluate_option_choices(tables, options, np.array([1, 1, 0]), 1.0)
+    np.testing.assert_allclose(found, [[-2, -np.inf], [-np.inf, -1], [0, 0]])
 
 
 def test_only_dead_ends_are_left_with_minus_infinity() -> None:
