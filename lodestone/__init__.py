@@ -13,6 +13,7 @@ for _id, _name, _step_limit in (
     ("lodestone/CorridorMaze-v0", "corridor-maze", 2000),
     ("lodestone/TwoRooms-v0", "two-rooms", 100),
     ("lodestone/Chain-v0", "chain", 100),
+    ("lodestone/RandomMDP-v0", "random-mdp", 100),
 ):
     gymnasium.register(
         id=_id,

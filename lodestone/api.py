@@ -12,6 +12,7 @@ from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
+from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.task import Task
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
@@ -39,6 +40,7 @@ __all__ = [
     "Policy",
     "Primitives",
     "QLearningConfig",
+    "RandomMDP",
     "Rules",
     "Script",
     "Scripted",

@@ -34,6 +34,10 @@ class TooManyStates(LodestoneError):
     """More reachable states than an exact method was allowed to enumerate."""
 
 
+class Unbounded(LodestoneError):
+    """Without a discount a cycle of states pays, so that there is no finite optimum."""
+
+
 class Diverged(LodestoneError):
     """A loss or a parameter stopped being a finite number during training."""
 

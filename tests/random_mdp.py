@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lodestone.envs.base import Environment
+from lodestone.envs.random_mdp import random_dynamics
 from lodestone.options.base import NO_CAP, Options
 from lodestone.planning.option_models import OptionTables
 from lodestone.planning.tables import Tables, tabulate
@@ -17,7 +18,7 @@ from lodestone.planning.tables import Tables, tabulate
 NUM_STATES, NUM_ACTIONS = 7, 3
 
 
-class RandomMDP(Environment):
+class ArrayMDP(Environment):
     """The state is a number; nature's draw is the next state. The last `goals` states are terminal."""
 
     probs: Float[Array, "S A S"]
@@ -59,24 +60,18 @@ class RandomMDP(Environment):
         raise NotImplementedError
 
 
-def random_mdp(seed: int, goals: int = 0) -> RandomMDP:
-    """P ~ Dirichlet(.4), R ~ N(0, 1)."""
-    probs, rewards = _random_arrays(seed)
-    return RandomMDP(jnp.asarray(probs, jnp.float32), jnp.asarray(rewards, jnp.float32), goals)
+def random_mdp(seed: int, goals: int = 0) -> ArrayMDP:
+    """The dynamics of `RandomMDP`, with episodes that begin in one of two states."""
+    probs, rewards = random_dynamics(seed, NUM_STATES, NUM_ACTIONS, 0.4)
+    return ArrayMDP(jnp.asarray(probs, jnp.float32), jnp.asarray(rewards, jnp.float32), goals)
 
 
 def random_tables(seed: int, goals: int = 0) -> Tables:
     """The tables of such a process, without the search for its states, which compiles anew for each environment."""
     tables = _tables_to_fill(goals)
-    probs, rewards = _random_arrays(seed)
+    probs, rewards = random_dynamics(seed, NUM_STATES, NUM_ACTIONS, 0.4)
     live = ~tables.terminal[:, None, None]
     return tables._replace(probs=np.where(live, probs, tables.probs), rewards=np.where(live, rewards, 0.0))
-
-
-def _random_arrays(seed: int) -> tuple[Float[np.ndarray, "S A S"], Float[np.ndarray, "S A S"]]:
-    rng = np.random.default_rng(seed)
-    probs = rng.dirichlet(np.full(NUM_STATES, 0.4), size=(NUM_STATES, NUM_ACTIONS))
-    return probs, rng.normal(size=probs.shape)
 
 
 @cache
@@ -85,7 +80,7 @@ def _tables_to_fill(goals: int) -> Tables:
 
 
 class RandomOptions(Options):
-    """Tables over the states of a `RandomMDP`, where one option may start anywhere."""
+    """Tables over the states of an `ArrayMDP`, where one option may start anywhere."""
 
     start: Bool[Array, "S O"]
     acts: Float[Array, "S O A"]

@@ -10,6 +10,7 @@ from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import UnknownName, check_name
@@ -21,6 +22,7 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
     "corridor-maze": CorridorMaze,
     "two-rooms": TwoRooms,
     "chain": Chain,
+    "random-mdp": RandomMDP,
 }
 """Every environment, by name."""
 

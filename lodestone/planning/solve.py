@@ -16,7 +16,7 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
 from lodestone.envs.base import Environment
-from lodestone.errors import InvalidConfig, LodestoneError
+from lodestone.errors import InvalidConfig, Unbounded
 from lodestone.planning.tables import Tables, tabulate
 
 MAX_UNDISCOUNTED_SWEEPS = 100_000
@@ -49,9 +49,11 @@ class Optimum(NamedTuple):
     goals: int
     """Terminal states among them."""
     optimal_steps: float
-    """Fewest expected primitive steps of a policy with the optimal return; inf where no policy surely ends."""
+    """Fewest expected primitive steps of a policy with the optimal return; inf where no policy surely ends, NaN where
+    the optimal return is +inf, because no policy reaches it."""
     optimal_return: float
-    """Return of the best policy without a discount; -inf where no policy surely ends."""
+    """Return of the best policy without a discount; -inf where no policy surely ends, +inf where a cycle of states that
+    can be reached pays, so that longer is always better."""
     discounted_value: float
     """Discounted return of the policy that is best under `discount`."""
     discount: float
@@ -64,7 +66,7 @@ def value_iteration(
 
     `allowed` restricts the actions (default: all). With a discount of 1, states from which no policy ends the episode
     with probability 1 are worth -inf.
-    Raises `InvalidConfig` for a discount outside [0, 1], and `LodestoneError` where the discount is 1 and a state is
+    Raises `InvalidConfig` for a discount outside [0, 1], and `Unbounded` where the discount is 1 and a state is
     worth +inf, because a cycle has a gain.
     """
     check_discount(discount)
@@ -121,15 +123,21 @@ def expected_steps(tables: Tables, policy: Int[np.ndarray, " S"] | Float[np.ndar
 
 
 def optimum(environment: Environment, discount: float = 0.99) -> Optimum:
-    """The exact answer for an environment. Raises `TooManyStates` and what `value_iteration` raises."""
+    """The exact answer for an environment. Raises `TooManyStates`, and what `value_iteration` does under `discount`."""
     tables = tabulate(environment)
-    best = value_iteration(tables, discount=1.0)
-    quickest = value_iteration(tables.with_step_reward(-1.0), discount=1.0, allowed=optimal_choices(best.action_values))
+    try:
+        best = value_iteration(tables, discount=1.0)
+    except Unbounded:
+        optimal_return, optimal_steps = np.inf, np.nan
+    else:
+        allowed = optimal_choices(best.action_values)
+        quickest = value_iteration(tables.with_step_reward(-1.0), discount=1.0, allowed=allowed)
+        optimal_return, optimal_steps = tables.initial_mean(best.values), -tables.initial_mean(quickest.values)
     return Optimum(
         states=tables.num_states,
         goals=int(tables.terminal.sum()),
-        optimal_steps=-tables.initial_mean(quickest.values),
-        optimal_return=tables.initial_mean(best.values),
+        optimal_steps=optimal_steps,
+        optimal_return=optimal_return,
         discounted_value=tables.initial_mean(value_iteration(tables, discount).values),
         discount=discount,
     )
@@ -160,7 +168,7 @@ def iterate_values(
     # The second bound is what rounding leaves of values as large as these.
     while change > max(threshold, 4e-16 * np.abs(values).max()):
         if discount == 1 and sweeps == MAX_UNDISCOUNTED_SWEEPS:
-            raise LodestoneError(
+            raise Unbounded(
                 f"Values did not settle in {MAX_UNDISCOUNTED_SWEEPS:,} sweeps without a discount: some cycle of states "
                 "pays, so the optimum is not finite. Use a discount below 1."
             )

@@ -11,6 +11,7 @@ from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
+from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.registry import ENVIRONMENTS
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.taxi import Taxi
@@ -30,6 +31,7 @@ CASES = {
     "taxi, index": Taxi(fickle=0.3, starts="any", observation="index"),
     "corridor-maze, small": CorridorMaze(2, 3, width=2, length=4, maze_seed=1, observation="cell"),
     "corridor-maze, deterministic": CorridorMaze(1, 2, move_success=1.0, pixels_per_cell=2),
+    "random-mdp, index": RandomMDP(mdp_seed=1, states=9, actions=2, goals=3, observation="index"),
     "chain, index": Chain(length=4, start=4, right_success=0.8, observation="index"),
     "two-rooms, cell": TwoRooms(observation="cell"),
 }
@@ -94,14 +96,16 @@ def test_a_transition_keeps_shapes_and_dtypes_so_that_one_compilation_serves(env
 def test_rewards_are_finite_floats_and_ends_are_bools(environment: Environment, states: State) -> None:
     @jax.jit
     @jax.vmap
-    def every_action(state: State) -> tuple:
-        def act(action: jax.Array) -> tuple:
-            after = environment.transition(state, action, jnp.int32(0))
+    def every_step(state: State) -> tuple:
+        def step(action: jax.Array, outcome: jax.Array) -> tuple:
+            after = environment.transition(state, action, outcome)
             return environment.reward(state, action, after), environment.terminal(after)
 
-        return jax.vmap(act)(jnp.arange(environment.num_actions))
+        each_outcome = jax.vmap(step, in_axes=(None, 0))
+        each_action = jax.vmap(each_outcome, in_axes=(0, None))
+        return each_action(jnp.arange(environment.num_actions), jnp.arange(environment.num_outcomes))
 
-    rewards, terminals = every_action(states)
+    rewards, terminals = every_step(states)
     assert rewards.dtype == jnp.float32
     assert terminals.dtype == jnp.bool_
     assert bool(jnp.all(jnp.isfinite(rewards)))

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_mdp import NUM_ACTIONS, NUM_STATES, RandomMDP, dense, random_tables
+from random_mdp import NUM_ACTIONS, NUM_STATES, ArrayMDP, dense, random_tables
 
 from lodestone.envs.magnet_arm import MagnetArm
-from lodestone.errors import InvalidConfig, LodestoneError
+from lodestone.errors import InvalidConfig, Unbounded
 from lodestone.planning import solve
 from lodestone.planning.solve import (
     evaluate_policy,
@@ -30,7 +30,7 @@ def small_world(moves: dict[tuple[int, int], dict[int, float]], pay: dict[tuple[
         for following, prob in moves.get((state, action), {state: 1.0}).items():
             probs[state, action, following] = prob
         rewards[state, action] = pay.get((state, action), 0.0)
-    return RandomMDP(jnp.asarray(probs, jnp.float32), jnp.asarray(rewards, jnp.float32), goals=1)
+    return ArrayMDP(jnp.asarray(probs, jnp.float32), jnp.asarray(rewards, jnp.float32), goals=1)
 
 
 @pytest.mark.parametrize(
@@ -153,8 +153,13 @@ def test_an_endless_problem_has_no_optimal_steps() -> None:
 def test_a_cycle_with_a_gain_has_no_finite_optimum(monkeypatch) -> None:
     monkeypatch.setattr(solve, "MAX_UNDISCOUNTED_SWEEPS", 200)
     world = small_world({(0, 1): {2: 1.0}, (1, 1): {0: 1.0}}, {(0, 0): 1.0}, size=3)
-    with pytest.raises(LodestoneError, match="cycle of states pays"):
+    with pytest.raises(Unbounded, match="cycle of states pays"):
         value_iteration(tabulate(world), 1.0)
+    best = optimum(world, discount=0.5)
+    assert best.optimal_return == np.inf
+    assert np.isnan(best.optimal_steps)
+    # Episodes begin in 0 or 1; from either, the cycle at 0 pays 1 at each step, in 1 from the next step on.
+    assert best.discounted_value == pytest.approx((2 + 1) / 2)
 
 
 @pytest.mark.parametrize("discount", [-0.1, 1.1, float("nan")])
