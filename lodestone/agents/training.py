@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lodestone.agents.dqn import DQNConfig, dqn
+from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.saved import Policy
 from lodestone.envs.base import Environment
@@ -17,9 +18,13 @@ from lodestone.learning.loop import train
 from lodestone.options.base import Options
 from lodestone.options.execution import Rules
 
-AgentConfig = DQNConfig | QLearningConfig
+AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig
 
-AGENTS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "q-learning": QLearningConfig}
+AGENTS: dict[str, type[AgentConfig]] = {
+    "dqn": DQNConfig,
+    "q-learning": QLearningConfig,
+    "intra-option": IntraOptionConfig,
+}
 """Every agent's settings, by the agent's name."""
 
 CHUNKS = 100
@@ -35,10 +40,10 @@ def train_policy(
     seeds: Sequence[int],
     on_chunk: Callable[[History, float], bool] = lambda history, fraction: False,
 ) -> tuple[Policy, History]:
-    """Train all seeds at once for `length` decisions each (Q-learning: primitive steps).
+    """Train all seeds at once for `length` decisions each (tabular agents: primitive steps).
 
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
-    True. Raises `InvalidConfig`, `Diverged`, `TooManyStates`.
+    True. Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
     """
     match config:
         case DQNConfig():
@@ -47,6 +52,9 @@ def train_policy(
         case QLearningConfig():
             name, scale, rounds = "q-learning", 1.0, -(-length // STEPS_PER_ROUND)
             algorithm = q_learning(config, environment, options, rules, length)
+        case IntraOptionConfig():
+            name, scale, rounds = "intra-option", 1.0, -(-length // STEPS_PER_ROUND)
+            algorithm = intra_option_q_learning(config, environment, options, rules, length)
 
     history = History(len(seeds), options.size)
     for carry, chunk in train(algorithm, seeds, rounds, -(-rounds // CHUNKS)):

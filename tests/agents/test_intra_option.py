@@ -1,0 +1,109 @@
+"""What intra-option Q-learning learns, against the planner's table; also about options that it never ran."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from corridor import Corridor, Walk
+from random_mdp import NUM_ACTIONS, RandomOptions, random_mdp, random_options
+
+from lodestone.agents.intra_option import IntraOptionConfig, Values, intra_option_q_learning, update
+from lodestone.agents.q_learning import STEPS_PER_ROUND
+from lodestone.envs.base import Environment
+from lodestone.errors import InvalidConfig, NoOptionAvailable
+from lodestone.learning.loop import train
+from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.execution import Rules
+from lodestone.planning.option_models import option_models, option_value_iteration, tabulate_options
+from lodestone.planning.tables import tabulate
+
+SETTLING = ((0.0, 0.5), (0.1, 0.1), (0.4, 0.02), (0.7, 0.004), (1.0, 0.001))
+"""A learning rate that falls about as 1/n."""
+
+
+def learn(config: IntraOptionConfig, environment: Environment, options: Options, rules: Rules, steps: int, seeds: int):
+    """Tables [seeds, S, O], and how often each option was chosen."""
+    algorithm = intra_option_q_learning(config, environment, options, rules, steps)
+    calls = np.zeros(options.size, dtype=int)
+    rounds = -(-steps // STEPS_PER_ROUND)
+    for carry, chunk in train(algorithm, range(seeds), rounds, -(-rounds // 10)):
+        calls += np.bincount(chunk.log.option[chunk.log.valid], minlength=options.size)
+    return np.asarray(carry.table)[:seeds], calls
+
+
+@pytest.mark.parametrize(("behaviour", "drawing"), [("primitives", False), ("primitives", True), ("options", True)])
+def test_learned_values_are_the_planners_also_of_options_that_never_ran(behaviour, drawing) -> None:
+    """Oracle T2, with the noise of single runs averaged out; options that draw their actions in some states, or none."""
+    mdp = random_mdp(seed=1, goals=1)
+    mixed = random_options(seed=5)
+    first_action = jax.nn.one_hot(jnp.argmax(mixed.acts, axis=2), NUM_ACTIONS)
+    names = tuple(f"primitive-{action}" for action in range(NUM_ACTIONS))
+    temporal = mixed if drawing else RandomOptions(mixed.start, first_action, mixed.stops, mixed.caps)
+    options = Union((Primitives(names), temporal))
+    config = IntraOptionConfig(learning_rate=SETTLING, epsilon=((0.0, 1.0),), behaviour=behaviour)
+    learned, calls = learn(config, mdp, options, Rules(discount=0.9, step_limit=50), 100_000, seeds=32)
+    tables = tabulate(mdp)
+    tabulated = tabulate_options(options, tables.space)
+    solution = option_value_iteration(tables, tabulated, 0.9)
+    live = ~tables.terminal
+    available = tabulated.initiation.T & live[:, None]
+    assert np.abs(learned.mean(axis=0) - solution.option_values)[available].max() < 0.05
+    # Where an option may not start: what going on with it is worth.
+    models = option_models(tables, tabulated, 0.9)
+    going_on = np.stack([model.rewards + model.backup(solution.values) for model in models], axis=1)
+    assert np.abs(learned.mean(axis=0) - going_on)[live].max() < 0.05
+    assert (calls[NUM_ACTIONS:] == 0).all() == (behaviour == "primitives")
+    assert (calls[:NUM_ACTIONS] > 0).all()
+
+
+def test_a_step_updates_the_options_that_would_have_taken_it_and_no_other() -> None:
+    values = Values(jnp.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), None)
+    weights, target = jnp.asarray([1.0, 0.0, 1.0]), jnp.asarray([3.0, 9.0, -1.0])
+    found, loss = update(values, jnp.int32(1), jnp.int32(0), weights, target, jnp.float32(0.5))
+    np.testing.assert_allclose(found.table, [[1, 2, 3], [3.5, 5, 2.5]])
+    assert float(loss) == pytest.approx((1 + 49) / 2)
+
+
+def test_an_option_that_draws_is_the_mean_over_its_actions() -> None:
+    by_action = jnp.asarray([[[2.0], [6.0]]])  # one state, two actions, one option
+    weights = jnp.asarray([0.25, 0.75])
+    values = Values(jnp.sum(by_action * weights[None, :, None], axis=1), by_action)
+    for action, target in ((0, 4.0), (1, 0.0), (1, 2.0)):
+        values, _ = update(
+            values, jnp.int32(0), jnp.int32(action), weights[action][None], jnp.asarray([target]), jnp.float32(0.5)
+        )
+    np.testing.assert_allclose(values.by_action, [[[3.0], [2.5]]])
+    np.testing.assert_allclose(values.table, [[0.25 * 3.0 + 0.75 * 2.5]])
+
+
+@pytest.mark.parametrize("bootstrap", [True, False])
+def test_a_time_limit_bootstraps_unless_it_is_taken_for_an_end(bootstrap) -> None:
+    """A walk along a corridor is cut after every second step; each step costs 1 and entering a cell pays its number."""
+    corridor = Corridor(length=6, step_reward=-1.0)
+    options = Union((Primitives(corridor.action_names), Walk(stop=5)))
+    rules = Rules(discount=0.9, step_limit=5, bootstrap_at_limit=bootstrap)
+    config = IntraOptionConfig(epsilon=((0.0, 1.0),))
+    learned, _ = learn(config, corridor, options, rules, 4000, seeds=1)
+    walk = [sum(0.9**step * (cell + step) for step in range(5 - cell)) for cell in range(5)]
+    if bootstrap:
+        np.testing.assert_allclose(learned[0][:5, 2], walk, rtol=1e-4)
+    else:
+        assert learned[0][0, 2] < walk[0] - 0.1
+
+
+def test_what_cannot_be_learned_from_single_steps_is_refused() -> None:
+    corridor = Corridor()
+    walk, primitives = Walk(stop=3), Primitives(corridor.action_names)
+    config = IntraOptionConfig()
+    with pytest.raises(InvalidConfig, match="'walk' is stopped after 7 steps.* cannot be learned from single steps"):
+        intra_option_q_learning(config, corridor, Union((primitives, Capped(walk, 7))), Rules(), 100)
+    intra_option_q_learning(config, corridor, Union((primitives, Capped(walk, 1))), Rules(), 100)
+    for rules in (Rules(undiscounted_option_reward=True), Rules(call_cost=0.5)):
+        with pytest.raises(InvalidConfig, match="within options takes the reward"):
+            intra_option_q_learning(config, corridor, primitives, rules, 100)
+    with pytest.raises(NoOptionAvailable):
+        intra_option_q_learning(IntraOptionConfig(behaviour="primitives"), corridor, walk, Rules(), 100)
+    with pytest.raises(InvalidConfig, match="behaviour is 'both'"):
+        IntraOptionConfig(behaviour="both")
