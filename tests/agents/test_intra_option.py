@@ -35,7 +35,7 @@ def learn(config: IntraOptionConfig, environment: Environment, options: Options,
 
 @pytest.mark.parametrize(("behaviour", "drawing"), [("primitives", False), ("primitives", True), ("options", True)])
 def test_learned_values_are_the_planners_also_of_options_that_never_ran(behaviour, drawing) -> None:
-    """Oracle T2, with the noise of single runs averaged out; options that draw their actions in some states, or none."""
+    """Oracle T2, the noise of single runs averaged out; options draw their actions in some states, or in none."""
     mdp = random_mdp(seed=1, goals=1)
     mixed = random_options(seed=5)
     first_action = jax.nn.one_hot(jnp.argmax(mixed.acts, axis=2), NUM_ACTIONS)
@@ -97,7 +97,7 @@ def test_what_cannot_be_learned_from_single_steps_is_refused() -> None:
     corridor = Corridor()
     walk, primitives = Walk(stop=3), Primitives(corridor.action_names)
     config = IntraOptionConfig()
-    with pytest.raises(InvalidConfig, match="'walk' is stopped after 7 steps.* cannot be learned from single steps"):
+    with pytest.raises(InvalidConfig, match=r"'walk' is stopped after 7 steps.* cannot be learned from single steps"):
         intra_option_q_learning(config, corridor, Union((primitives, Capped(walk, 7))), Rules(), 100)
     intra_option_q_learning(config, corridor, Union((primitives, Capped(walk, 1))), Rules(), 100)
     for rules in (Rules(undiscounted_option_reward=True), Rules(call_cost=0.5)):

@@ -1,4 +1,4 @@
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -13,6 +13,7 @@ from random_mdp import (
     NUM_STATES,
     RandomOptions,
     dense,
+    random_mdp,
     random_options,
     random_tables,
     simulated_model,
@@ -21,8 +22,11 @@ from random_mdp import (
 from lodestone.envs.magnet_arm import LEFT, MAGNET_OFF, RIGHT, MagnetArm, go_down_task, lift_task
 from lodestone.errors import InvalidConfig, LodestoneError, NoOptionAvailable
 from lodestone.options.base import NO_CAP, Options, Primitives, Union
+from lodestone.options.execution import Rules, draw_chance, start_actor, tick
 from lodestone.options.magnet_arm import GO_DOWN, LIFT
 from lodestone.options.scripted import Scripted
+from lodestone.options.tabular import on_numbers
+from lodestone.planning.enumerated import enumerated
 from lodestone.planning.option_models import (
     OptionTables,
     check_available,
@@ -37,7 +41,7 @@ from lodestone.planning.option_models import (
 )
 from lodestone.planning.solve import greedy_choices, optimal_choices, value_iteration
 from lodestone.planning.tables import Tables, tabulate
-from lodestone.types import State
+from lodestone.types import State, Transition
 
 seeds = st.integers(0, 10_000)
 caps = st.lists(st.sampled_from([NO_CAP, 1, 2, 5]), min_size=1, max_size=3).map(tuple)
@@ -210,6 +214,40 @@ def test_models_are_what_following_the_distribution_gives(seed, caps, goals, dis
         live = ~tables.terminal
         np.testing.assert_allclose(model.rewards, rewards, atol=1e-9)
         np.testing.assert_allclose(model.backup(np.eye(NUM_STATES))[live], ended[live], atol=1e-9)
+
+
+@pytest.mark.parametrize("caps", [(NO_CAP, NO_CAP, NO_CAP), (3, 1, NO_CAP)])
+def test_models_are_what_running_the_options_gives(caps: tuple[int, ...]) -> None:
+    """Oracle T1: 100,000 runs of each option by the executor, from one state, agree within 3.5 standard errors."""
+    runs, start = 100_000, 1
+    environment = random_mdp(seed=4, goals=1)
+    tables, options = tabulate(environment), random_options(seed=4, caps=caps)
+    world, numbered = enumerated(tables, environment.action_names), on_numbers(options, tables.space)
+    models = option_models(tables, tabulate_options(options, tables.space), 0.9)
+
+    @partial(jax.jit, static_argnums=1)
+    def run_all(key: Array, option: int) -> Transition:
+        def one(key: Array) -> Transition:
+            def step(carry: tuple) -> tuple:
+                key, actor, _ = carry
+                key, tick_key = jax.random.split(key)
+                actor, decision = tick(world, numbered, rules, draw_chance(tick_key), actor, jnp.int32(option))
+                return key, actor, decision
+
+            rules = Rules(discount=0.9)
+            actor = start_actor(world, key)._replace(state=jnp.int32(start))
+            return jax.lax.while_loop(lambda carry: ~carry[2].valid, step, step((key, actor, None)))[2].transition
+
+        return jax.vmap(one)(jax.random.split(key, runs))
+
+    for option, model in enumerate(models):
+        transitions = jax.tree.map(np.asarray, run_all(jax.random.key(option), option))
+        found = transitions.reward.astype(np.float64)
+        assert abs(found.mean() - model.rewards[start]) < 3.5 * found.std() / np.sqrt(runs)
+        # The executor's discount is 0 where the environment ended: that column of F is left out.
+        ended = np.where(np.arange(NUM_STATES) == transitions.next_obs[:, None], transitions.discount[:, None], 0.0)
+        exact = model.backup(np.eye(NUM_STATES))[start] * ~tables.terminal
+        assert np.all(np.abs(ended.mean(axis=0) - exact) <= 3.5 * ended.std(axis=0) / np.sqrt(runs))
 
 
 def test_call_cost_is_paid_once_a_call_and_not_for_primitives() -> None:

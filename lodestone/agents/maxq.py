@@ -1,0 +1,313 @@
+"""MAXQ-0 and MAXQ-Q: learning the values of a task graph from experience (Dietterich 2000, sections 3 and 4).
+
+Stored are the expected reward V(a, s) of each primitive action and the completion C(i, s, a) of each call. When the
+child a of subtask i ends in s' after N steps,
+
+    C(i, s, a)  <- C + alpha [ gamma^N             V(i, s')                  - C ]
+    C~(i, s, a) <- C~ + alpha [ gamma^N (R~_i(s') + max_a' Q~(i, s', a'))    - C~ ]     Q~(i, s, a) = V(a, s) + C~(i, s, a)
+
+where V(i, s') = V(b, s') + C(i, s', b) for the b with the largest Q~, and 0 if i has ended. C~ with the pseudo-reward
+R~ is what a subtask acts by; C without it is what its caller sees. *All-states updating* does the same for every state
+that the child went through. MAXQ-0 is the case without pseudo-rewards and without all-states updating.
+
+The recursion is unrolled into small events, one at a time in every seed: call a child, act, update one state, return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from lodestone.envs.base import Environment, initial_state, next_step, sample_initial
+from lodestone.errors import InvalidConfig
+from lodestone.learning.loop import Algorithm, RoundLog
+from lodestone.learning.policies import epsilon_greedy
+from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
+from lodestone.options.execution import Rules
+from lodestone.planning.enumerated import enumerated
+from lodestone.planning.tables import tabulate
+from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
+
+EVENTS_PER_ROUND = 64
+"""Events between two looks at the schedules."""
+
+
+@dataclass(frozen=True)
+class MAXQConfig:
+    """Settings of the learner."""
+
+    learning_rate: Knots = ((0.0, 0.25),)
+    """alpha over the run."""
+    epsilon: Knots = ((0.0, 0.3), (0.7, 0.02))
+    """Probability of a random child over the run."""
+    all_states: bool = True
+    """Whether every state that a child went through is updated when it ends, or only the one where it was called."""
+
+    def __post_init__(self) -> None:
+        check_knots("learning_rate", self.learning_rate, 0.0, 1.0)
+        check_knots("epsilon", self.epsilon, 0.0, 1.0)
+
+
+class Learned(NamedTuple):
+    """What is stored; the slots are those of `TaskTables`."""
+
+    values: Float[Array, " slots"]
+    """V of primitive actions and C of calls; all start at 0."""
+    inner: Float[Array, " slots"]
+    """C~ of calls; the same array's content as `values` if no subtask has a pseudo-reward."""
+
+
+class Hierarchy(NamedTuple):
+    """The stack of subtasks that run; D levels, the root is level 0."""
+
+    depth: Int[Array, ""]
+    """The level that is up."""
+    subtask: Int[Array, " D"]
+    edge: Int[Array, " D"]
+    """The call that each level made last."""
+    called_at: Int[Array, " D"]
+    """The step of the episode at which it was made."""
+
+
+class Carry(NamedTuple):
+    """Everything that one seed carries from round to round."""
+
+    learned: Learned
+    hierarchy: Hierarchy
+    state: Int[Array, ""]
+    visited: Int[Array, " L"]
+    """The states of the episode."""
+    steps: Int[Array, ""]
+    """Steps of the episode."""
+    level: Int[Array, ""]
+    """The level whose call has ended and is being learned from."""
+    position: Int[Array, ""]
+    """The step whose state is updated next; below the step of the call where there is nothing to learn from."""
+    cut: Bool[Array, ""]
+    """Whether the episode was ended by a limit, and the stack is being left without learning."""
+    episode_return: Float[Array, ""]
+    total_steps: Int[Array, ""]
+    key: PRNGKeyArray
+
+
+class Values(NamedTuple):
+    """What is known about one state."""
+
+    nodes: Float[Array, " A+T"]
+    """V of every action and subtask, pseudo-rewards left out."""
+    inner_edges: Float[Array, " E"]
+    """Q~ of every call; -inf where it is not allowed."""
+    inner_subtasks: Float[Array, " T"]
+    """max Q~ of every subtask, or its pseudo-reward where it has ended."""
+    choices: Int[Array, " T"]
+    """The edge with the largest Q~, the first of equals."""
+
+
+class Arrays(NamedTuple):
+    """`TaskTables` on the device, the state first."""
+
+    completion_slot: Int[Array, "S E"]
+    reward_slot: Int[Array, "S A"]
+    available: Bool[Array, "S E"]
+    ends: Bool[Array, "S T"]
+    pseudo_rewards: Float[Array, "S T"]
+
+
+def on_device(tasks: TaskTables) -> Arrays:
+    """The arrays that `values_at` looks up."""
+    return Arrays(
+        completion_slot=jnp.asarray(tasks.completion_slot.T),
+        reward_slot=jnp.asarray(tasks.reward_slot.T),
+        available=jnp.asarray(tasks.available.T),
+        ends=jnp.asarray(tasks.ends.T),
+        pseudo_rewards=jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32),
+    )
+
+
+def values_at(tasks: TaskTables, arrays: Arrays, learned: Learned, state: Int[Array, ""]) -> Values:
+    """All values of one state, from the primitive actions up."""
+    slot = arrays.completion_slot[state]
+    completions = jnp.where(slot >= 0, learned.values[slot], 0.0)
+    inner_completions = jnp.where(slot >= 0, learned.inner[slot], 0.0)
+    available, ends, pseudo_rewards = arrays.available[state], arrays.ends[state], arrays.pseudo_rewards[state]
+
+    # One number at a time rather than arrays of a subtask's children: the compiler makes one loop over seeds of it all.
+    nodes = dict(enumerate(learned.values[arrays.reward_slot[state]]))
+    inner_edges: list[Array] = [jnp.float32(-jnp.inf)] * len(tasks.edges)
+    inner_subtasks, choices = {}, {}
+    for subtask in tasks.bottom_up:
+        best_inner, best_value, choice = jnp.float32(-jnp.inf), jnp.float32(0), jnp.int32(0)
+        for number in tasks.edges_of(subtask):
+            below = nodes[tasks.edges[number].child]
+            inner = jnp.where(available[number], below + inner_completions[number], -jnp.inf)
+            better = inner > best_inner
+            best_inner = jnp.where(better, inner, best_inner)
+            best_value = jnp.where(better, below + completions[number], best_value)
+            choice = jnp.where(better, number, choice)
+            inner_edges[number] = inner
+        nodes[tasks.num_actions + subtask] = jnp.where(ends[subtask], 0.0, best_value)
+        inner_subtasks[subtask] = jnp.where(ends[subtask], pseudo_rewards[subtask], best_inner)
+        choices[subtask] = choice
+
+    def ordered(found: dict[int, Array]) -> Array:
+        return jnp.stack([found[number] for number in sorted(found)])
+
+    return Values(ordered(nodes), jnp.stack(inner_edges), ordered(inner_subtasks), ordered(choices))
+
+
+def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: Rules, steps: int) -> Algorithm:
+    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
+    `steps`, primitive steps.
+
+    A limit, of steps or of decisions, which are steps here, unwinds the stack without learning from calls that had not
+    ended. Raises `TooManyStates`, `InvalidTaskGraph`, and `InvalidConfig` for rules without a limit or that are about
+    options.
+    """
+    if rules.call_cost or rules.undiscounted_option_reward or not rules.bootstrap_at_limit:
+        raise InvalidConfig("MAXQ has no call cost, no undiscounted option reward, and takes no limit for an end.")
+    limits = [limit for limit in (rules.step_limit, rules.decision_limit) if limit is not None]
+    if not limits:
+        raise InvalidConfig("MAXQ remembers the states of an episode, so it needs a step limit.")
+    limit = min(limits)
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(graph, environment, tables)
+    world, arrays = enumerated(tables, environment.action_names), on_device(tasks)
+    with_pseudo_rewards = bool(tasks.pseudo_rewards.any())
+    num_actions, levels = tasks.num_actions, graph.levels
+    caller = jnp.asarray([edge.subtask for edge in tasks.edges], dtype=jnp.int32)
+    edges_of = _padded([tasks.edges_of(subtask) for subtask in range(len(tasks.ends))])
+    child_of = jnp.asarray([edge.child for edge in tasks.edges], dtype=jnp.int32)
+
+    def init(key: PRNGKeyArray) -> Carry:
+        start_key, key = jax.random.split(key)
+        zeros, none = jnp.zeros(tasks.num_slots), jnp.zeros(levels, dtype=jnp.int32)
+        return Carry(
+            learned=Learned(zeros, zeros if with_pseudo_rewards else jnp.zeros(0)),
+            hierarchy=Hierarchy(jnp.int32(0), none, none, none),
+            state=sample_initial(world, start_key),
+            visited=jnp.zeros(limit, dtype=jnp.int32),
+            steps=jnp.int32(0),
+            level=jnp.int32(0),
+            position=jnp.int32(-1),
+            cut=jnp.bool_(False),
+            episode_return=jnp.float32(0),
+            total_steps=jnp.int32(0),
+            key=key,
+        )
+
+    def event(
+        carry: Carry, noise: Float[Array, "4"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
+    ) -> tuple[Carry, RoundLog]:
+        """Update one state if a call has ended and not all of its states are updated; else return from a subtask that
+        has ended; else call a child, which, if it is a primitive action, acts."""
+        hierarchy, state, steps = carry.hierarchy, carry.state, carry.steps
+        learned = carry.learned if with_pseudo_rewards else Learned(carry.learned.values, carry.learned.values)
+        known, ends = values_at(tasks, arrays, learned, state), arrays.ends[state]
+
+        up, subtask = hierarchy.depth, hierarchy.subtask[hierarchy.depth]
+        updating = carry.position >= hierarchy.called_at[carry.level]
+        ended = ends[hierarchy.subtask] & (jnp.arange(levels) <= up)
+        returning = ~updating & (jnp.any(ended) | carry.cut)
+        calling = ~updating & ~returning
+        episode_over = returning & (up == 0)
+
+        edges = edges_of[subtask]
+        allowed = (edges >= 0) & arrays.available[state, edges]
+        choice = edges[epsilon_greedy(noise[:2], known.inner_edges[edges], allowed, epsilon)]
+        child = child_of[choice]
+        acting = calling & (child < num_actions)
+        descending = calling & ~acting
+        action = jnp.minimum(child, num_actions - 1)
+        step = next_step(world, noise[2], state, action)
+        cut = acting & (steps + 1 >= limit) & ~step.terminated
+
+        # What is learned: from the call of a level, or, on acting, from the reward of the action.
+        edge = hierarchy.edge[carry.level]
+        subject = caller[edge]
+        slot = jnp.where(updating, arrays.completion_slot[carry.visited[carry.position], edge], -1)
+        slot = jnp.where(acting, arrays.reward_slot[state, action], slot)
+        weight = jnp.float32(rules.discount) ** (steps - carry.position).astype(jnp.float32)
+        target = jnp.where(acting, step.reward, weight * known.nodes[num_actions + subject])
+        error = jnp.where(slot >= 0, target - learned.values[slot], 0.0)
+        values = learned.values.at[slot].add(learning_rate * error)
+        inner = values
+        if with_pseudo_rewards:
+            inner_target = jnp.where(acting, step.reward, weight * known.inner_subtasks[subject])
+            inner_error = jnp.where(slot >= 0, inner_target - learned.inner[slot], 0.0)
+            inner = learned.inner.at[slot].add(learning_rate * inner_error)
+
+        # A call is learned from when it has ended by itself, not when a subtask above it has.
+        from_child = returning & ~episode_over & ends[subtask] & ~carry.cut
+        level = jnp.where(acting, up, jnp.where(returning, up - 1, carry.level))
+        last = jnp.where(acting, steps, steps - 1)
+        first = jnp.where(acting, steps, hierarchy.called_at[jnp.maximum(up - 1, 0)])
+        begins = acting | from_child
+        position = jnp.where(updating, carry.position - 1, -1)
+        position = jnp.where(begins, last if config.all_states else first, position)
+
+        called = jnp.arange(levels) == jnp.where(calling, up, levels)
+        entered = jnp.arange(levels) == jnp.where(descending, up + 1, levels)
+        after = Hierarchy(
+            depth=jnp.where(episode_over, 0, up + descending.astype(jnp.int32) - returning.astype(jnp.int32)),
+            subtask=jnp.where(entered, child - num_actions, hierarchy.subtask),
+            edge=jnp.where(called, choice, hierarchy.edge),
+            called_at=jnp.where(called, steps, hierarchy.called_at),
+        )
+        moved = jnp.where(acting, step.state, state)
+        total = jnp.where(acting, carry.episode_return + step.reward, carry.episode_return)
+        taken = steps + acting.astype(jnp.int32)
+        next_carry = Carry(
+            learned=Learned(values, inner if with_pseudo_rewards else carry.learned.inner),
+            hierarchy=after,
+            state=jnp.where(episode_over, initial_state(world, noise[3]), moved),
+            visited=carry.visited.at[jnp.where(acting, steps, limit)].set(state, mode="drop"),
+            steps=jnp.where(episode_over, 0, taken),
+            level=level,
+            position=position,
+            cut=(carry.cut | cut) & ~episode_over,
+            episode_return=jnp.where(episode_over, 0.0, total),
+            total_steps=carry.total_steps + acting.astype(jnp.int32),
+            key=carry.key,
+        )
+        log = RoundLog(
+            valid=acting,
+            option=choice,
+            steps=jnp.int32(1),
+            episode_ended=step.terminated | cut,
+            terminated=step.terminated,
+            episode_return=total,
+            episode_steps=taken,
+            episode_decisions=taken,
+            loss=jnp.square(error),
+        )
+        return next_carry, log
+
+    def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
+        """`EVENTS_PER_ROUND` events."""
+        del number
+        fraction = carry.total_steps.astype(jnp.float32) / steps
+        epsilon = piecewise_linear(config.epsilon, fraction)
+        learning_rate = piecewise_linear(config.learning_rate, fraction)
+        noise_key, key = jax.random.split(carry.key)
+        noise = jax.random.uniform(noise_key, (EVENTS_PER_ROUND, 4))
+        carry, log = jax.lax.scan(lambda carry, noise: event(carry, noise, epsilon, learning_rate), carry, noise)
+        return carry._replace(key=key), log._replace(loss=jnp.mean(log.loss))
+
+    return Algorithm(init, run_round)
+
+
+def rounds_for(graph: TaskGraph, steps: int) -> int:
+    """Rounds that are surely enough for so many primitive steps: an action takes an event to be called and one to be
+    learned from, and every level above it at most a call, a return and an update a step."""
+    return -(-steps * (2 + 3 * (graph.levels - 1)) // EVENTS_PER_ROUND)
+
+
+def _padded(rows: list[tuple[int, ...]]) -> Int[Array, "T U"]:
+    """Rows of one length, filled up with -1."""
+    width = max(map(len, rows))
+    return jnp.asarray([row + (-1,) * (width - len(row)) for row in rows], dtype=jnp.int32)
