@@ -22,7 +22,7 @@ from lodestone.learning.targets import semi_markov_target
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Chance, Decision, Rules, start_actor, tick
 from lodestone.options.tabular import on_numbers
-from lodestone.planning.enumerated import enumerated
+from lodestone.planning.enumerated import Enumerated, enumerated
 from lodestone.planning.tables import tabulate
 
 STEPS_PER_ROUND = 32
@@ -74,11 +74,17 @@ def q_learning(
     """
     tables = tabulate(environment)
     world = enumerated(tables, environment.action_names)
-    numbered = on_numbers(options, tables.space)
+    return q_learning_on_numbers(config, world, on_numbers(options, tables.space), rules, steps)
+
+
+def q_learning_on_numbers(
+    config: QLearningConfig, world: Enumerated, options: Options, rules: Rules, steps: int
+) -> Algorithm:
+    """The same in a world of numbered states, with options on these numbers."""
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        return Carry(jnp.zeros((tables.num_states, options.size)), start_actor(world, actor_key), key)
+        return Carry(jnp.zeros((world.ends.size, options.size)), start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`STEPS_PER_ROUND` primitive steps, each with an update if a decision ends on it."""
@@ -89,9 +95,9 @@ def q_learning(
 
         def step(carry: tuple[Array, Actor], noise: Float[Array, "6"]) -> tuple[tuple[Array, Actor], tuple]:
             table, actor = carry
-            available = numbered.initiation(actor.state)
+            available = options.initiation(actor.state)
             choice = epsilon_greedy(noise[:2], table[actor.state], available, epsilon)
-            actor, decision = tick(world, numbered, rules, Chance(*noise[2:]), actor, choice)
+            actor, decision = tick(world, options, rules, Chance(*noise[2:]), actor, choice)
             table, loss = update(table, decision, learning_rate)
             return (table, actor), (decision, loss)
 

@@ -15,9 +15,10 @@ from jaxtyping import Bool, Int
 from lodestone.envs.four_rooms import CELLS, HALLWAYS, NUMBER, SQUARES, FourRooms
 from lodestone.envs.state_space import reachable_states
 from lodestone.options.base import NO_CAP
+from lodestone.options.subgoals import Subgoal, solve_subgoal
 from lodestone.options.tabular import TabularOptions
-from lodestone.planning.solve import optimal_choices, value_iteration
-from lodestone.planning.tables import Tables, tabulate
+from lodestone.planning.solve import greedy_choices
+from lodestone.planning.tables import tabulate
 
 DOORS = dict(zip(("north", "west", "east", "south"), (int(NUMBER[hallway]) for hallway in HALLWAYS), strict=True))
 """The cell of each hallway."""
@@ -62,22 +63,10 @@ def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
 def _policy(
     rooms: FourRooms, door: int, region: Bool[np.ndarray, " cells"], discount: float
 ) -> Int[np.ndarray, " cells"]:
-    """The best action of each cell in the house whose goal is the door and where leaving the region is the end."""
-    tables = tabulate(dataclasses.replace(rooms, goal=door, goal_reward=1.0, step_reward=0.0))
+    """The best action of each cell. The goal of the house is moved to the door, so that it does not stand in the way."""
+    tables = tabulate(dataclasses.replace(rooms, goal=door))
     cell = np.asarray(tables.space.states.cell)
-    problem = _ended_outside(tables, (region | (np.arange(CELLS) == door))[cell])
-    action_values = value_iteration(problem, discount).action_values
+    subgoal = Subgoal("door", region[cell], values=(cell == door).astype(np.float64))
     policy = np.zeros(CELLS, dtype=np.int64)
-    policy[cell] = optimal_choices(action_values).argmax(axis=1)
+    policy[cell] = greedy_choices(solve_subgoal(tables, subgoal, discount).action_values)
     return policy
-
-
-def _ended_outside(tables: Tables, region: Bool[np.ndarray, " S"]) -> Tables:
-    """The same process, ended for nothing by leaving the region."""
-    stays = np.arange(tables.num_states)[:, None, None]
-    inside = region[:, None, None]
-    return tables._replace(
-        successors=np.where(inside, tables.successors, stays).astype(tables.successors.dtype),
-        rewards=np.where(inside, tables.rewards, 0.0),
-        terminal=tables.terminal | ~region,
-    )
