@@ -1,6 +1,7 @@
 """The names that most programs on top of Lodestone need, in one place."""
 
 from lodestone.agents.dqn import DQNConfig
+from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.playing import Playback, play, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.q_learning import QLearningConfig
@@ -19,10 +20,12 @@ from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
 from lodestone.learning.networks import NetworkConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
-from lodestone.options.catalogue import scripted_options
+from lodestone.options.catalogue import named_options, scripted_options
 from lodestone.options.execution import Rules
 from lodestone.options.four_rooms import hallway_options
 from lodestone.options.scripted import Script, Scripted
+from lodestone.options.subgoals import Subgoal, subgoal_options
+from lodestone.planning.interruption import Interrupting
 from lodestone.planning.solve import optimum
 
 __all__ = [
@@ -32,6 +35,8 @@ __all__ = [
     "DQNConfig",
     "Environment",
     "FourRooms",
+    "Interrupting",
+    "IntraOptionConfig",
     "LodestoneError",
     "MagnetArm",
     "NetworkConfig",
@@ -44,6 +49,7 @@ __all__ = [
     "Rules",
     "Script",
     "Scripted",
+    "Subgoal",
     "Task",
     "Taxi",
     "TwoRooms",
@@ -54,6 +60,7 @@ __all__ = [
     "lift_task",
     "load_options",
     "load_policy",
+    "named_options",
     "optimum",
     "play",
     "pretrain",
@@ -61,6 +68,7 @@ __all__ = [
     "save_options",
     "save_policy",
     "scripted_options",
+    "subgoal_options",
     "train_policy",
     "use_all_cores",
 ]

@@ -21,6 +21,7 @@ from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional
 
 from lodestone import __version__
+from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.playing import play, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.run_folder import POLICY, RunFolder
@@ -37,8 +38,9 @@ from lodestone.files import json_safe, prepare_folder
 from lodestone.learning.history import History
 from lodestone.learning.networks import NetworkConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
-from lodestone.options.catalogue import scripted_options, tasks
+from lodestone.options.catalogue import named_options, tasks
 from lodestone.options.execution import Rules
+from lodestone.options.tabular import TabularOptions
 from lodestone.planning.option_models import check_available, fewest_decisions, tabulate_options
 from lodestone.planning.solve import optimum
 from lodestone.planning.tables import tabulate
@@ -71,7 +73,7 @@ class Plan(Generic[EnvironmentT]):
     discount: float = 0.99
     """Discount of the discounted value."""
     options: tuple[str, ...] = ()
-    """Hand-written options to plan with beside the primitive actions: adds the fewest decisions."""
+    """Ready-made options to plan with beside the primitive actions: adds the fewest decisions."""
     json: bool = False
     """Print one JSON object."""
 
@@ -90,9 +92,10 @@ class Train(Generic[AgentT, EnvironmentT]):
     seeds: int = 1
     """How many seeds, trained at once."""
     options: tuple[str, ...] = ()
-    """Hand-written options by name, or one file of saved options."""
-    option_cap: int = magnet_tower.OPTION_CAP
-    """Steps after which an option is stopped."""
+    """Ready-made options by name, or one file of saved options."""
+    option_cap: int | None = None
+    """Steps after which an option is stopped. Default: 21 for scripts and networks, none for exact tables; none for
+    agents that learn within options, which take no caps."""
     primitives: bool = True
     """Whether the agent may choose primitive actions besides the options."""
     out: Path | None = None
@@ -218,7 +221,7 @@ def _plan(plan: Plan) -> None:
     if plan.options:
         tables = tabulate(plan.environment)
         options = tabulate_options(
-            Union((Primitives(plan.environment.action_names), scripted_options(plan.environment, plan.options))),
+            Union((Primitives(plan.environment.action_names), named_options(plan.environment, plan.options))),
             tables.space,
         )
         content["optimal_decisions"] = -tables.initial_mean(fewest_decisions(tables, options).values)
@@ -244,8 +247,11 @@ def _choose_options(train: Train) -> Options:
     if train.options:
         first = Path(train.options[0])
         is_file = len(train.options) == 1 and (first.suffix or first.exists())
-        temporal = load_options(first, environment) if is_file else scripted_options(environment, train.options)
-        parts.append(Capped(temporal, train.option_cap))
+        temporal = load_options(first, environment) if is_file else named_options(environment, train.options)
+        cap = train.option_cap
+        if cap is None and not isinstance(train.agent, IntraOptionConfig) and not isinstance(temporal, TabularOptions):
+            cap = magnet_tower.OPTION_CAP
+        parts.append(temporal if cap is None else Capped(temporal, cap))
     options = Union(tuple(parts))
     if not train.primitives:
         tables = tabulate(environment)

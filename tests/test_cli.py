@@ -5,10 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jax
 import pytest
 
 from lodestone import __version__
+from lodestone.agents.playing import play
+from lodestone.agents.saved import load_policy
 from lodestone.cli import main
+from lodestone.options.base import NO_CAP
+from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
 TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
 SMALL = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32", "--learning-starts", "100"]
@@ -91,6 +96,43 @@ def test_train_prints_json_and_writes_nothing_without_out(capsys, tmp_path, monk
     assert list(tmp_path.iterdir()) == []
 
 
+def test_plan_knows_the_hallways(capsys):
+    """Of the 103 cells to begin in, the 52 of the two eastern rooms and their western hallways are one hallway away
+    from the goal in the east, the other 51 are two."""
+    words = ["plan", "four-rooms", "--dynamics", "deterministic", "--json", "--options"]
+    code, out, _ = run(capsys, *words, "hallways")
+    found = json.loads(out)
+    assert code == 0
+    assert found["optimal_decisions"] == pytest.approx((52 + 2 * 51) / 103)
+    code, out, _ = run(capsys, *words, "south-east-to-east", "north-east-to-east")
+    assert found["optimal_decisions"] < json.loads(out)["optimal_decisions"] < found["optimal_steps"]
+
+
+@pytest.mark.parametrize("agent", ["q-learning", "intra-option"])
+def test_hallway_options_are_trained_with_saved_and_watched(agent, capsys, tmp_path):
+    words = ["train", agent, "four-rooms", "--dynamics", "deterministic", "--options", "hallways", "--seeds", "2"]
+    code, out, _ = run(capsys, *words, "--steps", "60000", "--out", str(tmp_path / "run"), "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert [row["success"] for row in found["seeds"]] == [True, True]
+    policy = load_policy(tmp_path / "run" / "policy.safetensors")
+    assert policy.agent == agent
+    assert policy.options.names[4:] == HALLWAY_OPTIONS
+    assert policy.options.max_steps == (1,) * 4 + (NO_CAP,) * 8
+    again = play(policy, jax.random.key(0))
+    assert again.steps.tolist() == [row["greedy_steps"] for row in found["seeds"]]
+    code, out, _ = run(capsys, "watch", str(tmp_path / "run"))
+    assert code == 0
+    assert "step   1:" in out
+
+
+def test_scripts_are_capped_unless_the_agent_learns_within_options(capsys, tmp_path):
+    for agent, cap in (("q-learning", 21), ("intra-option", NO_CAP)):
+        words = ["train", agent, "magnet-arm", *TINY, "--options", "lift", "--steps", "1000"]
+        assert run(capsys, *words, "--out", str(tmp_path / agent))[0] == 0
+        assert load_policy(tmp_path / agent / "policy.safetensors").options.max_steps[-1] == cap
+
+
 REFUSED = [
     (["nonsense"], "no command named 'nonsense'"),
     (["plan"], "needs the name of an environment"),
@@ -106,7 +148,12 @@ REFUSED = [
     (["train", "dqn", "magnet-arm", "--learning-rate", "0", "nan"], "learning_rate"),
     (["train", "dqn", "magnet-arm", "--learning-rate", "0", "inf"], "learning_rate"),
     (["train", "dqn", "magnet-arm", "--options", "fly"], "no option named 'fly'"),
-    (["train", "dqn", "four-rooms", "--options", "fly"], "no option named 'fly'; there are none here"),
+    (["train", "dqn", "taxi", "--options", "fly"], "no option named 'fly'; there are none here"),
+    (["plan", "four-rooms", "--options", "fly"], "no option named 'fly'; there are: hallways, north-west-to-north,"),
+    (["train", "q-learning", "four-rooms", "--options", "hallways", "south-east-to-east"], "need different names"),
+    (["train", "dqn", "magnet-arm", "--options", "lift", "--option-cap", "0"], "step cap is 0"),
+    (["train", "intra-option", "magnet-arm", "--options", "lift", "--option-cap", "9"], "stopped after 9 steps"),
+    (["train", "intra-option", "magnet-arm", "--call-cost", "0.5"], "call_cost is 0.5"),
     (["plan", "four-rooms", "--goal", "104"], "goal is 104"),
     (["train", "dqn", "magnet-arm", "--options", "missing.safetensors"], "missing.safetensors"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),

@@ -31,6 +31,9 @@ ROOMS = {
 }
 """First and last square of each room, and its two hallways."""
 
+HALLWAY_OPTIONS = tuple(f"{room}-to-{door}" for room, (_, _, doors) in ROOMS.items() for door in doors)
+"""Names of the eight options."""
+
 
 def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
     """Eight options, one for each hallway of each room.
@@ -39,12 +42,11 @@ def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
     Its policy has the highest expected discount^k for the k steps to its hallway, where leaving the cells in which it
     may start by any other way is worth 0. Of equally good actions the first is taken.
     """
-    names, may_start, policies, goes_on = [], [], [], []
-    for room, (first, last, doors) in ROOMS.items():
+    may_start, policies, goes_on = [], [], []
+    for first, last, doors in ROOMS.values():
         inside = np.all((first <= SQUARES) & (last >= SQUARES), axis=1)
         for door, other in (doors, doors[::-1]):
             starts = inside | (np.arange(CELLS) == DOORS[other])
-            names.append(f"{room}-to-{door}")
             may_start.append(starts)
             policies.append(_policy(rooms, DOORS[door], starts, discount))
             goes_on.append(inside & (np.arange(CELLS) != rooms.goal))
@@ -52,8 +54,8 @@ def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
     cell = np.asarray(space.states.cell)
     return TabularOptions(
         space,
-        tuple(names),
-        (NO_CAP,) * len(names),
+        HALLWAY_OPTIONS,
+        (NO_CAP,) * len(HALLWAY_OPTIONS),
         initiation_table=jnp.asarray(np.stack(may_start, axis=1)[cell]),
         policy_table=jnp.asarray(np.eye(rooms.num_actions, dtype=np.float32)[np.stack(policies, axis=1)[cell]]),
         termination_table=jnp.asarray(~np.stack(goes_on, axis=1)[cell], dtype=jnp.float32),
@@ -63,7 +65,7 @@ def hallway_options(rooms: FourRooms, discount: float = 0.9) -> TabularOptions:
 def _policy(
     rooms: FourRooms, door: int, region: Bool[np.ndarray, " cells"], discount: float
 ) -> Int[np.ndarray, " cells"]:
-    """The best action of each cell. The goal of the house is moved to the door, so that it does not stand in the way."""
+    """The best action of each cell. The goal of the house is moved to the door, where it is in nobody's way."""
     tables = tabulate(dataclasses.replace(rooms, goal=door))
     cell = np.asarray(tables.space.states.cell)
     subgoal = Subgoal("door", region[cell], values=(cell == door).astype(np.float64))

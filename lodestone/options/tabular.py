@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lodestone.envs.state_space import Numbers, StateSpace
+from lodestone.errors import check_name
 from lodestone.options.base import Options
 from lodestone.planning.option_models import tabulate_options
 from lodestone.types import State
@@ -38,6 +41,21 @@ class TabularOptions(Options):
 
     def termination(self, state: State) -> Float[Array, " O"]:
         return self.termination_table[self.space.index_of(state)]
+
+
+def chosen(options: TabularOptions, names: Sequence[str]) -> TabularOptions:
+    """Some of the options by name, in this order. Raises `UnknownName`."""
+    for name in names:
+        check_name("option", name, options.names)
+    positions = jnp.asarray([options.names.index(name) for name in names], dtype=jnp.int32)
+    return TabularOptions(
+        options.space,
+        tuple(names),
+        tuple(options.caps[options.names.index(name)] for name in names),
+        initiation_table=options.initiation_table[:, positions],
+        policy_table=options.policy_table[:, positions],
+        termination_table=options.termination_table[:, positions],
+    )
 
 
 def as_tabular(options: Options, space: StateSpace) -> TabularOptions:
