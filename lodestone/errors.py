@@ -22,6 +22,10 @@ class NoOptionAvailable(LodestoneError):
     """A reachable state where no option may start."""
 
 
+class InvalidTaskGraph(LodestoneError):
+    """Subtasks that call what does not exist, call one another in a circle, or get stuck."""
+
+
 class BadFile(LodestoneError):
     """A file that is missing, truncated, foreign, or saved for another problem."""
 

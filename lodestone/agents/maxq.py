@@ -3,8 +3,9 @@
 Stored are the expected reward V(a, s) of each primitive action and the completion C(i, s, a) of each call. When the
 child a of subtask i ends in s' after N steps,
 
-    C(i, s, a)  <- C + alpha [ gamma^N             V(i, s')                  - C ]
-    C~(i, s, a) <- C~ + alpha [ gamma^N (R~_i(s') + max_a' Q~(i, s', a'))    - C~ ]     Q~(i, s, a) = V(a, s) + C~(i, s, a)
+    C(i, s, a)  <- C + alpha [ gamma^N V(i, s') - C ]
+    C~(i, s, a) <- C~ + alpha [ gamma^N (R~_i(s') + max_a' Q~(i, s', a')) - C~ ]
+    Q~(i, s, a)  = V(a, s) + C~(i, s, a)
 
 where V(i, s') = V(b, s') + C(i, s', b) for the b with the largest Q~, and 0 if i has ended. C~ with the pseudo-reward
 R~ is what a subtask acts by; C without it is what its caller sees. *All-states updating* does the same for every state
@@ -16,6 +17,7 @@ The recursion is unrolled into small events, one at a time in every seed: call a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -31,6 +33,7 @@ from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.execution import Rules
 from lodestone.planning.enumerated import enumerated
 from lodestone.planning.tables import tabulate
+from lodestone.subtasks.recursive import polled_policy
 from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
 
 EVENTS_PER_ROUND = 64
@@ -47,6 +50,10 @@ class MAXQConfig:
     """Probability of a random child over the run."""
     all_states: bool = True
     """Whether every state that a child went through is updated when it ends, or only the one where it was called."""
+    abstraction: bool = True
+    """Whether states that a child sees alike share a value."""
+    pseudo_rewards: bool = True
+    """Whether subtasks act by their pseudo-rewards. Without them, and without `all_states`, this is MAXQ-0."""
 
     def __post_init__(self) -> None:
         check_knots("learning_rate", self.learning_rate, 0.0, 1.0)
@@ -59,7 +66,7 @@ class Learned(NamedTuple):
     values: Float[Array, " slots"]
     """V of primitive actions and C of calls; all start at 0."""
     inner: Float[Array, " slots"]
-    """C~ of calls; the same array's content as `values` if no subtask has a pseudo-reward."""
+    """C~ of calls; empty if no subtask has a pseudo-reward, as it would be the same."""
 
 
 class Hierarchy(NamedTuple):
@@ -175,7 +182,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         raise InvalidConfig("MAXQ remembers the states of an episode, so it needs a step limit.")
     limit = min(limits)
     tables = tabulate(environment)
-    tasks = tabulate_tasks(graph, environment, tables)
+    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
     world, arrays = enumerated(tables, environment.action_names), on_device(tasks)
     with_pseudo_rewards = bool(tasks.pseudo_rewards.any())
     num_actions, levels = tasks.num_actions, graph.levels
@@ -299,6 +306,58 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         return carry._replace(key=key), log._replace(loss=jnp.mean(log.loss))
 
     return Algorithm(init, run_round)
+
+
+def as_configured(config: MAXQConfig, graph: TaskGraph) -> TaskGraph:
+    """The graph with as much abstraction and as many pseudo-rewards as the learner uses."""
+    graph = graph if config.abstraction else graph.without_abstraction()
+    return graph if config.pseudo_rewards else graph.without_pseudo_rewards()
+
+
+def greedy_choices(
+    config: MAXQConfig, environment: Environment, graph: TaskGraph, learned: Learned
+) -> Int[np.ndarray, "T S"]:
+    """The edge that each subtask takes in each state by what one seed has learned; -1 where it has ended."""
+    tasks, values = _everywhere(config, environment, graph, learned)
+    return np.where(tasks.ends, -1, np.asarray(values.choices).T)
+
+
+def polled_values(
+    config: MAXQConfig, environment: Environment, graph: TaskGraph, learned: Learned
+) -> Float[np.ndarray, "S A"]:
+    """What one seed expects of each primitive action where every step asks anew from the root down: the rewards and
+    completions along the best path to the action, -inf where there is none. Its maximum is the action that polling
+    takes, also where pseudo-rewards choose another path than the best."""
+    tasks, values = _everywhere(config, environment, graph, learned)
+    states = np.arange(tasks.ends.shape[1])
+    slots = tasks.completion_slot
+    completions = np.where(slots >= 0, np.asarray(learned.values)[slots], 0.0)
+    nodes = np.asarray(values.nodes)
+    paths = {action: np.full((len(states), tasks.num_actions), -np.inf) for action in range(tasks.num_actions)}
+    for action, path in paths.items():
+        path[:, action] = nodes[:, action]
+    for subtask in tasks.bottom_up:
+        calls = [
+            np.where(tasks.available[number], completions[number], -np.inf)[:, None] + paths[tasks.edges[number].child]
+            for number in tasks.edges_of(subtask)
+        ]
+        paths[tasks.num_actions + subtask] = np.max(calls, axis=0)
+    found = np.where(tasks.ends[0][:, None], 0.0, paths[tasks.num_actions])
+    polled = polled_policy(tasks, np.where(tasks.ends, -1, np.asarray(values.choices).T))
+    found[states, polled] = np.nextafter(found.max(axis=1).astype(np.float32), np.float32(np.inf))
+    return found.astype(np.float32)
+
+
+def _everywhere(
+    config: MAXQConfig, environment: Environment, graph: TaskGraph, learned: Learned
+) -> tuple[TaskTables, Values]:
+    """What is known about every state."""
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
+    values = jnp.asarray(learned.values)
+    learned = Learned(values, jnp.asarray(learned.inner) if learned.inner.size else values)
+    ask = jax.jit(jax.vmap(partial(values_at, tasks, on_device(tasks), learned)))
+    return tasks, ask(jnp.arange(tables.num_states))
 
 
 def rounds_for(graph: TaskGraph, steps: int) -> int:

@@ -102,18 +102,19 @@ def _require_alike(
     tables: Tables,
 ) -> None:
     """`wanted` is what the first state of a slot, or a call that is final, would store."""
-    used, first, back = np.unique(slots, return_index=True, return_inverse=True)
-    with np.errstate(invalid="ignore"):
-        off = np.abs(values - wanted[first][back])
-    wrong = (slots != -2) & ~((off <= ABSTRACTION_TOLERANCE) | (values == wanted[first][back]))
+    _, first, back = np.unique(slots, return_index=True, return_inverse=True)
+    stored = wanted[first][back]
+    # Infinities are alike, too, and have no difference.
+    alike = (values == stored) | (np.abs(np.nan_to_num(values) - np.nan_to_num(stored)) <= ABSTRACTION_TOLERANCE)
+    wrong = (slots != -2) & ~alike
     if wrong.any():
         state = int(wrong.argmax())
+        here = f"{values[state]:g} in {state_text(tables.space, state)}"
+        if slots[state] == -1:
+            raise InvalidTaskGraph(f"{name!r} is not final: its {what} is {here}.")
         raise InvalidTaskGraph(
-            f"The abstraction of {name!r} is not safe: its {what} is {values[state]:g} in "
-            f"{state_text(tables.space, state)}, but is stored together with {wanted[first][back][state]:g}, that of "
-            f"{state_text(tables.space, int(first[back][state]))}."
-            if slots[state] != -1
-            else f"{name!r} is not final: its completion is {values[state]:g} in {state_text(tables.space, state)}."
+            f"The abstraction of {name!r} is not safe: its {what} is {here}, but is stored together with "
+            f"{stored[state]:g}, that of {state_text(tables.space, int(first[back][state]))}."
         )
 
 

@@ -94,7 +94,6 @@ class TaskGraph:
         """The names that each subtask calls."""
         return {subtask.name: tuple(child.name for child in subtask.children) for subtask in self.subtasks}
 
-
     @property
     def levels(self) -> int:
         """D, the most subtasks that can run at a time, each called by the one before."""
@@ -111,6 +110,10 @@ class TaskGraph:
             for subtask in self.subtasks
         )
         return TaskGraph(subtasks)
+
+    def without_pseudo_rewards(self) -> TaskGraph:
+        """The same graph where every subtask is judged by the environment's rewards alone."""
+        return replace(self, subtasks=tuple(replace(subtask, pseudo_reward=None) for subtask in self.subtasks))
 
 
 class Edge(NamedTuple):
@@ -148,9 +151,7 @@ class TaskTables(NamedTuple):
     @property
     def edge_names(self) -> tuple[str, ...]:
         """Caller and called, such as `get/pickup`."""
-        return tuple(
-            f"{self.names[self.num_actions + edge.subtask]}/{self.names[edge.child]}" for edge in self.edges
-        )
+        return tuple(f"{self.names[self.num_actions + edge.subtask]}/{self.names[edge.child]}" for edge in self.edges)
 
     def edges_of(self, subtask: int) -> tuple[int, ...]:
         """Numbers of a subtask's edges."""
@@ -182,7 +183,9 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
 
     def everywhere(ask: Callable[[State], Array]) -> np.ndarray:
         ask_batch = jax.jit(jax.vmap(ask))
-        parts = [np.asarray(ask_batch(states))[: rows.stop - rows.start] for rows, states in state_batches(tables.space)]
+        parts = [
+            np.asarray(ask_batch(states))[: rows.stop - rows.start] for rows, states in state_batches(tables.space)
+        ]
         return np.concatenate(parts)
 
     ends = np.stack([everywhere(subtask.ends).astype(bool) | tables.terminal for subtask in graph.subtasks])

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from lodestone.envs.taxi import ABOARD, DELIVERED, LANDMARK_AT, LANDMARK_NAMES, SIDE, Taxi, TaxiState
-from lodestone.subtasks.task_graph import Child, Feature, Predicate, Subtask, TaskGraph
+from lodestone.subtasks.task_graph import Child, Feature, Subtask, TaskGraph
 
 WRONG_PLACE_REWARD = -100.0
 """Pseudo-reward of *put* for setting the passenger down where he did not want to go."""
 
 
-def taxi_tasks(taxi: Taxi, abstraction: bool = True) -> TaskGraph:
+def taxi_tasks(taxi: Taxi) -> TaskGraph:
     """Root{get, put}; get{pickup, navigate}; put{putdown, navigate}; navigate{south, north, east, west}.
 
-    *Get* may only navigate to where the passenger waits, *put* only to his destination. `abstraction` adds Dietterich's
-    state abstractions (section 5.5), of which those of *get* and of navigating are safe without a discount only: the
-    time that a child takes is not seen.
+    *Get* may only navigate to where the passenger waits, *put* only to his destination. The state abstractions are
+    Dietterich's (section 5.5). Those of getting the passenger and of navigating are safe without a discount only, as
+    the time that a child takes is not seen.
     """
 
-    def to_each_landmark(bound: Predicate) -> tuple[Child, ...]:
+    def to_each_landmark(bound: Callable[..., Bool[Array, ""]]) -> tuple[Child, ...]:
         """Navigating, to the landmark of which `bound` is true."""
         return tuple(
             Child(f"to-{name}", when=partial(bound, landmark=landmark), sees=_nothing)
@@ -45,8 +46,7 @@ def taxi_tasks(taxi: Taxi, abstraction: bool = True) -> TaskGraph:
         ),
     )
     rewards_see: dict[str, Feature] = dict.fromkeys(taxi.action_names[:4], _nothing)
-    graph = TaskGraph(subtasks, rewards_see | {"pickup": _here_is_passenger, "putdown": _what_putdown_does})
-    return graph if abstraction else graph.without_abstraction()
+    return TaskGraph(subtasks, rewards_see | {"pickup": _here_is_passenger, "putdown": _what_putdown_does})
 
 
 def _delivered(state: TaxiState) -> Bool[Array, ""]:

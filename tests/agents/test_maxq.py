@@ -1,0 +1,106 @@
+"""What MAXQ learns, against the exact values of the task graph."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from lodestone.agents.maxq import Learned, MAXQConfig, as_configured, greedy_choices, maxq, polled_values, rounds_for
+from lodestone.envs.base import Environment
+from lodestone.envs.taxi import Taxi
+from lodestone.envs.two_rooms import TwoRooms
+from lodestone.errors import InvalidConfig
+from lodestone.learning.history import History
+from lodestone.learning.loop import train
+from lodestone.options.execution import Rules
+from lodestone.planning.solve import evaluate_policy
+from lodestone.planning.tables import tabulate
+from lodestone.subtasks.catalogue import task_graph
+from lodestone.subtasks.recursive import evaluate_choices, recursive_optimum
+from lodestone.subtasks.task_graph import tabulate_tasks
+
+EXPLORING = ((0.0, 0.5), (1.0, 0.3))
+DECAYING = ((0.0, 0.5), (0.5, 0.5), (1.0, 0.01))
+
+
+def learn(config: MAXQConfig, environment: Environment, rules: Rules, steps: int, seeds: int = 5):
+    """What each seed has learned after so many steps, and what happened."""
+    graph = task_graph(environment)
+    algorithm, rounds = maxq(config, environment, graph, rules, steps), rounds_for(graph, steps)
+    history = History(seeds, 64)
+    for carry, chunk in train(algorithm, range(seeds), rounds, -(-rounds // 50)):
+        history.add(chunk)
+        if min(history.taken(seed)[1] for seed in range(seeds)) >= steps:
+            break
+    learned = jax.tree.map(np.asarray, carry.learned)
+    return [Learned(*(leaf[seed] for leaf in learned)) for seed in range(seeds)], history
+
+
+@pytest.mark.parametrize("pseudo_rewards", [True, False])
+@pytest.mark.parametrize("all_states", [True, False])
+def test_two_rooms(pseudo_rewards, all_states):
+    """-7.75 with the pseudo-reward, the recursive optimum of -8.5 without, in every seed."""
+    rooms, config = TwoRooms(), MAXQConfig(((0.0, 0.5),), EXPLORING, all_states, pseudo_rewards=pseudo_rewards)
+    seeds, _ = learn(config, rooms, Rules(discount=1.0, step_limit=50), 60_000)
+    tables = tabulate(rooms)
+    tasks = tabulate_tasks(as_configured(config, task_graph(rooms)), rooms, tables)
+    for learned in seeds:
+        choices = greedy_choices(config, rooms, task_graph(rooms), learned)
+        found = evaluate_choices(tasks, tables, choices).values[0]
+        assert tables.initial_mean(found) == pytest.approx(-7.75 if pseudo_rewards else -8.5)
+
+
+@pytest.mark.parametrize(
+    ("environment", "discount", "steps", "call"),
+    [(Taxi(), 1.0, 60_000, "to-R/north"), (TwoRooms(), 0.9, 100_000, "root/exit")],
+    ids=["taxi", "two rooms, discounted"],
+)
+def test_learned_values_are_the_exact_ones(environment, discount, steps, call):
+    """The root's value where episodes begin, and completions; exploration fades, as it changes what children do."""
+    config = MAXQConfig(((0.0, 0.5), (0.5, 0.25), (1.0, 0.05)), DECAYING)
+    graph, tables = task_graph(environment), tabulate(environment)
+    seeds, _ = learn(config, environment, Rules(discount=discount, step_limit=200), steps, seeds=3)
+    tasks = tabulate_tasks(graph, environment, tables)
+    exact, begins = recursive_optimum(tasks, tables, discount), tables.initial_probs > 0
+    number = tasks.edge_names.index(call)
+    slots = tasks.completion_slot[number]
+    for learned in seeds:
+        root = polled_values(config, environment, graph, learned).max(axis=1)
+        assert np.median(np.abs(root - exact.values[0])[begins]) < 0.02
+        used = (slots >= 0) & (learned.values[slots] != 0)
+        assert used.sum() > 20
+        assert np.median(np.abs(learned.values[slots] - exact.completions[number])[used]) < 0.05
+
+
+@pytest.mark.parametrize(
+    "abstraction", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["abstraction", "whole states"]
+)
+def test_the_taxi_is_learned_to_the_optimum(abstraction):
+    """Deterministic, Gymnasium's rewards: 7.93 over the 300 starts, in every seed."""
+    taxi = Taxi()
+    config = MAXQConfig(((0.0, 0.25 if abstraction else 0.5),), ((0.0, 0.3), (0.8, 0.02)), abstraction=abstraction)
+    seeds, history = learn(config, taxi, Rules(discount=1.0, step_limit=1000), 60_000 if abstraction else 250_000)
+    tables = tabulate(taxi)
+    for number, learned in enumerate(seeds):
+        policy = polled_values(config, taxi, task_graph(taxi), learned).argmax(axis=1)
+        assert tables.initial_mean(evaluate_policy(tables, policy, 1.0)) == pytest.approx(7.93)
+        assert history.episodes(number).success[-100:].all()
+        assert history.episodes(number).total_reward[-200:].mean() > 6
+
+
+def test_an_episode_pays_what_its_steps_pay():
+    """Each step costs 1 in the two rooms, so returns are minus lengths; a limit ends what has missed the goal."""
+    _, history = learn(MAXQConfig(), TwoRooms(), Rules(discount=1.0, step_limit=30), 2000, seeds=2)
+    for seed in range(2):
+        episodes = history.episodes(seed)
+        np.testing.assert_array_equal(episodes.total_reward, -episodes.length_steps)
+        assert (episodes.length_steps[~episodes.success] == 30).all()
+        assert 0 < episodes.success.mean() < 1
+
+
+def test_rules_without_a_limit_are_refused():
+    with pytest.raises(InvalidConfig, match="step limit"):
+        maxq(MAXQConfig(), TwoRooms(), task_graph(TwoRooms()), Rules(), 100)
+    with pytest.raises(InvalidConfig, match="call cost"):
+        maxq(MAXQConfig(), TwoRooms(), task_graph(TwoRooms()), Rules(step_limit=10, call_cost=1.0), 100)
