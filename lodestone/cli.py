@@ -287,7 +287,7 @@ def _train(train: Train, agent: str) -> None:
             means = " ".join(f"{values.mean():.1f}" if len(values) else "-" for values in returns)
             progress.advance(max(fraction, min(1.0, steps / train.steps)), f"{steps:,} steps, mean return {means}")
             if folder is not None:
-                folder.log(history, seeds, options.names)
+                folder.log(history, seeds)
             return steps >= train.steps
 
         policy, history = train_policy(train.agent, environment, options, rules, train.steps, seeds, tell)

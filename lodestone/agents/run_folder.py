@@ -26,7 +26,7 @@ class RunFolder:
         write_json(path / CONFIG, {"lodestone": __version__, **config})
         self._metrics = (path / METRICS).open("a", encoding="utf-8")
 
-    def log(self, history: History, seeds: tuple[int, ...], option_names: tuple[str, ...]) -> None:
+    def log(self, history: History, seeds: tuple[int, ...]) -> None:
         """One line per seed about the last chunk and the last 50 episodes."""
         usage = history.usage[-1]
         for position, seed in enumerate(seeds):
@@ -43,7 +43,7 @@ class RunFolder:
                 "mean_decisions": _mean(episodes.length_decisions[recent]),
                 "success_rate": _mean(episodes.success[recent]),
                 "loss": float(usage.loss[position]),
-                "calls": dict(zip(option_names, usage.calls[position].tolist(), strict=True)),
+                "calls": dict(zip(history.choices, usage.calls[position].tolist(), strict=True)),
                 "seconds": round(usage.seconds, 3),
             }
             self._metrics.write(json.dumps(line) + "\n")

@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PyTree
 
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
+from lodestone.agents.maxq import Learned, MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.saved import Policy
 from lodestone.envs.base import Environment
+from lodestone.errors import InvalidConfig
 from lodestone.learning.history import History
-from lodestone.learning.loop import train
+from lodestone.learning.loop import Algorithm, train
 from lodestone.options.base import Options
 from lodestone.options.execution import Rules
+from lodestone.planning.tables import tabulate
+from lodestone.subtasks.catalogue import task_graph
+from lodestone.subtasks.task_graph import tabulate_tasks
 
-AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig
+AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig
 
 AGENTS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
     "q-learning": QLearningConfig,
     "intra-option": IntraOptionConfig,
+    "maxq": MAXQConfig,
 }
 """Every agent's settings, by the agent's name."""
 
@@ -42,25 +51,73 @@ def train_policy(
 ) -> tuple[Policy, History]:
     """Train all seeds at once for `length` decisions each (tabular agents: primitive steps).
 
-    `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
-    True. Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
+    MAXQ learns in the environment's ready-made task graph; its options must be the primitive actions, and its policy is
+    the one that asks anew from the root down at every step. `on_chunk` gets what happened so far and the fraction of
+    the run that is over, and may end the run by returning True.
+    Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
     """
+    name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
+    plan = _plan(config, environment, options, rules, length)
+    history = History(len(seeds), plan.choices)
+    for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS)):
+        history.add(chunk)
+        steps = min(history.taken(position)[1] for position in range(len(seeds)))
+        fraction = max(chunk.rounds / plan.rounds, steps / length if plan.ends_by_steps else 0.0)
+        if on_chunk(history, min(fraction, 1.0)) or (plan.ends_by_steps and steps >= length):
+            break
+    learned = plan.learned(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(seeds)], plan.of_carry(carry)))
+    return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
+
+
+class _Plan(NamedTuple):
+    """How an agent is trained, and what of it is kept."""
+
+    algorithm: Algorithm
+    rounds: int
+    of_carry: Callable[[Any], PyTree]
+    """What a policy is made from, with a leading seed axis."""
+    choices: tuple[str, ...]
+    learned: Callable[[PyTree], PyTree] = partial(jax.tree.map, jnp.asarray)
+    """What a policy keeps."""
+    reward_scale: float = 1.0
+    ends_by_steps: bool = False
+    """Whether `rounds` is only a bound, as a round has no fixed number of steps."""
+
+
+def _plan(config: AgentConfig, environment: Environment, options: Options, rules: Rules, length: int) -> _Plan:
     match config:
         case DQNConfig():
-            name, scale, rounds = "dqn", config.reward_scale, config.rounds(length)
-            algorithm = dqn(config, environment, options, rules, length)
+            return _Plan(
+                algorithm=dqn(config, environment, options, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.learner.network,
+                choices=options.names,
+                reward_scale=config.reward_scale,
+            )
         case QLearningConfig():
-            name, scale, rounds = "q-learning", 1.0, -(-length // STEPS_PER_ROUND)
-            algorithm = q_learning(config, environment, options, rules, length)
+            return _tables(q_learning(config, environment, options, rules, length), options, length)
         case IntraOptionConfig():
-            name, scale, rounds = "intra-option", 1.0, -(-length // STEPS_PER_ROUND)
-            algorithm = intra_option_q_learning(config, environment, options, rules, length)
+            return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)
+        case MAXQConfig():
+            if options.names != environment.action_names:
+                raise InvalidConfig("MAXQ chooses among the subtasks of its task graph: it takes no options.")
+            graph = task_graph(environment)
+            tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
 
-    history = History(len(seeds), options.size)
-    for carry, chunk in train(algorithm, seeds, rounds, -(-rounds // CHUNKS)):
-        history.add(chunk)
-        if on_chunk(history, chunk.rounds / rounds):
-            break
-    learned = carry.learner.network if name == "dqn" else carry.table
-    learned = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[: len(seeds)]), learned)
-    return Policy(name, environment, options, rules, learned, scale, tuple(seeds)), history
+            def polled(learned: Learned) -> Float[Array, "seeds S A"]:
+                seeds = [Learned(*arrays) for arrays in zip(*learned, strict=True)]
+                return jnp.stack([polled_values(config, environment, graph, seed) for seed in seeds])
+
+            return _Plan(
+                algorithm=maxq(config, environment, graph, rules, length),
+                rounds=rounds_for(graph, length),
+                of_carry=lambda carry: carry.learned,
+                choices=tasks.edge_names,
+                learned=polled,
+                ends_by_steps=True,
+            )
+
+
+def _tables(algorithm: Algorithm, options: Options, steps: int) -> _Plan:
+    """Of a learner of one table of option values."""
+    return _Plan(algorithm, -(-steps // STEPS_PER_ROUND), lambda carry: carry.table, options.names)

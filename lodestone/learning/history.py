@@ -41,22 +41,23 @@ class Usage(NamedTuple):
 class History:
     """Grows chunk by chunk."""
 
-    def __init__(self, seeds: int, options: int) -> None:
+    def __init__(self, seeds: int, choices: tuple[str, ...]) -> None:
+        """`choices`: the names of what the learner chooses from, which the logs count."""
+        self.choices = choices
         self._episodes: list[list[np.ndarray]] = [[] for _ in range(seeds)]
         self._taken = np.zeros((seeds, 2), dtype=np.int64)  # decisions, steps
-        self._options = options
         self.usage: list[Usage] = []
 
     def add(self, chunk: Chunk) -> None:
         """Append what a chunk brought."""
         log = jax.tree.map(np.asarray, chunk.log)
         seeds = log.valid.shape[0]
-        calls = np.zeros((seeds, self._options), dtype=np.int64)
-        steps = np.zeros((seeds, self._options), dtype=np.int64)
+        calls = np.zeros((seeds, len(self.choices)), dtype=np.int64)
+        steps = np.zeros((seeds, len(self.choices)), dtype=np.int64)
         for seed in range(seeds):
             decisions = jax.tree.map(lambda leaf, seed=seed: leaf[seed][log.valid[seed]], log._replace(loss=None))
-            calls[seed] = np.bincount(decisions.option, minlength=self._options)
-            steps[seed] = np.bincount(decisions.option, weights=decisions.steps, minlength=self._options)
+            calls[seed] = np.bincount(decisions.option, minlength=len(self.choices))
+            steps[seed] = np.bincount(decisions.option, weights=decisions.steps, minlength=len(self.choices))
             columns = (
                 self._taken[seed, 0] + 1 + np.arange(len(decisions.option)),
                 self._taken[seed, 1] + np.cumsum(decisions.steps),

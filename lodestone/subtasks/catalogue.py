@@ -19,6 +19,5 @@ def task_graph(environment: Environment) -> TaskGraph:
             return taxi_tasks(environment)
         case TwoRooms():
             return two_rooms_tasks(environment)
-    raise InvalidConfig(
-        f"There is no ready-made task graph for {type(environment).__name__}; taxi and two-rooms have one."
-    )
+    name = describe_environment(environment)["name"]
+    raise InvalidConfig(f"There is no ready-made task graph for {name}; taxi and two-rooms have one.")

@@ -28,7 +28,7 @@ def learn(config: MAXQConfig, environment: Environment, rules: Rules, steps: int
     """What each seed has learned after so many steps, and what happened."""
     graph = task_graph(environment)
     algorithm, rounds = maxq(config, environment, graph, rules, steps), rounds_for(graph, steps)
-    history = History(seeds, 64)
+    history = History(seeds, ("",) * 64)
     for carry, chunk in train(algorithm, range(seeds), rounds, -(-rounds // 50)):
         history.add(chunk)
         if min(history.taken(seed)[1] for seed in range(seeds)) >= steps:

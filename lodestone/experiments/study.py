@@ -1,0 +1,80 @@
+"""What an experiment has to show when it is not a comparison of towers: curves over seeds, tables, numbers to reach.
+
+One shape for all of them, so that figures, the report and `results.json` are written once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lodestone.experiments.comparison import Gate
+from lodestone.learning.progress import Progress
+
+
+@dataclass(frozen=True)
+class Series:
+    """One learner's curve."""
+
+    name: str
+    x: Float[np.ndarray, " X"]
+    seeds: Float[np.ndarray, "S X"]
+    """One row per seed; not a number where a seed has no value."""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One diagram: the interquartile mean over seeds of each series, with its 95 % interval."""
+
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...]
+    references: tuple[tuple[str, float], ...] = ()
+    """Exact values drawn as horizontal lines: (name, height)."""
+    log_x: bool = False
+    y_range: tuple[float, float] | None = None
+    """Lowest and highest value shown; early learners can be far below what matters."""
+
+
+@dataclass(frozen=True)
+class NumberTable:
+    """Exact or measured numbers."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str | float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Study:
+    """What one experiment has found."""
+
+    name: str
+    """As in `lodestone reproduce --experiment NAME`."""
+    title: str
+    summary: str
+    """What is compared and what is to be seen, in a few sentences."""
+    seeds: int
+    panels: tuple[Panel, ...]
+    tables: tuple[NumberTable, ...]
+    gates: tuple[Gate, ...]
+    drawings: tuple[tuple[str, str], ...] = ()
+    """(title, SVG) of further pictures, such as machines."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment that can be run by name."""
+
+    name: str
+    title: str
+    seeds: int
+    """How many by default."""
+    work: float
+    """What `run` reports as progress in all, with so many seeds; any unit."""
+    run: Callable[[int, Progress], Study]
+    """run(seeds, progress) -> what was found."""
