@@ -143,13 +143,18 @@ def has_options(agent: AgentRun) -> bool:
     return len(agent.option_names) > agent.primitives
 
 
+def draw_curve(axes: Axes, curve: Curve, colour: str, **of_mean: Any) -> None:
+    """Thin lines for single seeds, a band, and the interquartile mean, which takes further settings of a line."""
+    axes.plot(curve.x, curve.seeds.T, color=colour, linewidth=0.5, alpha=0.3)
+    axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
+    axes.plot(curve.x, curve.iqm, color=colour, linewidth=1.8, **of_mean)
+
+
 def draw_panel(axes: Axes, comparison: Comparison, axis: Axis, quantity: Quantity) -> None:
     """Every agent's interquartile mean with its band, every seed as a thin line, and the exact optimum."""
     for agent, colour in zip(comparison.agents, agent_colours(len(comparison.agents)), strict=True):
         curve = learning_curve(agent.episodes, axis, quantity)
-        axes.plot(curve.x, curve.seeds.T, color=colour, linewidth=0.5, alpha=0.3)
-        axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
-        axes.plot(curve.x, curve.iqm, color=colour, linewidth=1.8, label=agent.name)
+        draw_curve(axes, curve, colour, label=agent.name)
     if quantity is LENGTH:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -172,7 +177,7 @@ def draw_panel(axes: Axes, comparison: Comparison, axis: Axis, quantity: Quantit
     axes.margins(y=0.09)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
+    axes.xaxis.set_major_formatter(FuncFormatter(thousands))
     axes.set_xlabel(axis.label)
     axes.set_ylabel(quantity.label)
 
@@ -191,7 +196,8 @@ def _optima(comparison: Comparison, quantity: Quantity) -> list[tuple[float, str
     return optima
 
 
-def _thousands(value: float, _: int) -> str:
+def thousands(value: float, _: int) -> str:
+    """The tick label of a count."""
     return f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"
 
 
@@ -205,7 +211,7 @@ def draw_usage_panel(axes: Axes, agent: AgentRun, colours: Sequence[str]) -> Non
     axes.set_ylim(0, 1)
     axes.grid(False)
     axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.xaxis.set_major_formatter(FuncFormatter(_thousands))
+    axes.xaxis.set_major_formatter(FuncFormatter(thousands))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0%}"))
     axes.set_xlabel(DECISIONS.label)
     axes.set_ylabel("share of decisions")
@@ -250,7 +256,7 @@ def draw_learning_curves(comparison: Comparison, path: str | Path) -> None:
             fontsize=8,
             color=MUTED,
         )
-        _save(figure, path)
+        save_figure(figure, path)
 
 
 def draw_option_usage(comparison: Comparison, path: str | Path) -> None:
@@ -268,10 +274,11 @@ def draw_option_usage(comparison: Comparison, path: str | Path) -> None:
             # In the order of the areas, seen from above.
             axes.legend(handles[::-1], labels[::-1], loc="center left", bbox_to_anchor=(1.01, 0.5))
         figure.suptitle(f"{comparison.title}: options used", x=0.01, ha="left", fontsize=12, fontweight="bold")
-        _save(figure, path)
+        save_figure(figure, path)
 
 
-def _save(figure: Figure, path: str | Path) -> None:
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure in the format of the path's ending. Raises `CannotWrite`."""
     path = Path(path)
     content = BytesIO()
     figure.savefig(content, format=path.suffix.removeprefix(".") or "png")

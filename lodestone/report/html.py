@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
-import re
 from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from html import escape
-from importlib.resources import files
 from io import BytesIO
 from itertools import groupby
 from pathlib import Path
-from string import Template
 
 import numpy as np
 from jaxtyping import UInt8
@@ -21,7 +17,7 @@ from PIL import Image
 
 from lodestone.agents.playing import Playback
 from lodestone.experiments.comparison import Comparison, Gate, OptionRun
-from lodestone.files import json_safe, write_atomically
+from lodestone.files import json_safe
 from lodestone.report.curves import (
     DECISIONS,
     LENGTH,
@@ -34,15 +30,20 @@ from lodestone.report.curves import (
     has_options,
     panel_svg,
 )
-from lodestone.report.palette import AGENTS, GRID, INK, MUTED, PAPER, option_colours, text_on
+from lodestone.report.page import (
+    AGENT_COLOURS,
+    PAGE_COLOURS,
+    chart_figure,
+    gates_section,
+    header,
+    interval_text,
+    joined,
+    settings_section,
+    table_head,
+    write_page,
+)
+from lodestone.report.palette import AGENTS, option_colours, text_on
 from lodestone.report.results import THRESHOLD_WINDOW, Row, Summary, agent_rows
-
-HEADLINE = ("command", "seconds", "machine")
-"""Settings that are shown at the top, if they are given; the others are in a table at the end."""
-
-PAGE_COLOURS = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)", PAPER: "var(--card)"}
-AGENT_COLOURS = {colour: f"var(--agent-{index})" for index, colour in enumerate(AGENTS)}
-"""Colours of a figure that follow the page from light to dark. Those of options do not: text stands on them."""
 
 
 def write_report(
@@ -53,61 +54,28 @@ def write_report(
 
     Raises `CannotWrite`.
     """
-    parts = [_header(comparisons, gates, settings)]
+    parts = [
+        header(
+            "Lodestone report",
+            " · ".join(comparison.title for comparison in comparisons),
+            gates,
+            [len(agent.seeds) for comparison in comparisons for agent in comparison.agents],
+            settings,
+        )
+    ]
     if gates:
-        parts.append(_gates(gates))
+        parts.append(gates_section(gates))
     parts += [_comparison(comparison) for comparison in comparisons]
-    parts.append(_settings(settings))
-    _write_page("Lodestone report", "\n".join(parts), path)
+    parts.append(settings_section(settings))
+    write_page("Lodestone report", "\n".join(parts), path)
 
 
 def write_player(playback: Playback, path: str | Path) -> None:
     """Write a page with the player of one episode. Raises `CannotWrite`."""
-    _write_page(f"{playback.agent}, seed {playback.seed}", _player(playback), path)
-
-
-def _write_page(title: str, body: str, path: str | Path) -> None:
-    template = Template((files("lodestone.report") / "template.html").read_text(encoding="utf-8"))
-    write_atomically(path, template.substitute(title=escape(title), body=body).encode())
+    write_page(f"{playback.agent}, seed {playback.seed}", _player(playback), path)
 
 
 # --------------------------------------------------------------------------------------------------- the page's parts
-
-
-def _header(comparisons: Sequence[Comparison], gates: Sequence[Gate], settings: Mapping[str, object]) -> str:
-    tiles = []
-    if gates:
-        tiles.append(("Gates passed", f"{sum(gate.passed for gate in gates)} of {len(gates)}"))
-    seeds = sorted({len(agent.seeds) for comparison in comparisons for agent in comparison.agents})
-    if seeds:
-        tiles.append(("Seeds per learner", " or ".join(map(str, seeds))))
-    seconds = settings.get("seconds")
-    if isinstance(seconds, int | float):
-        tiles.append(("Wall-clock time", _duration(seconds)))
-    if "machine" in settings:
-        tiles.append(("Machine", str(settings["machine"])))
-    parts = [
-        "<header>",
-        "<h1>Lodestone report</h1>",
-        f'<p class="muted">{escape(" · ".join(comparison.title for comparison in comparisons))}</p>',
-    ]
-    if "command" in settings:
-        parts.append(f'<pre aria-label="The command that was run">{escape(str(settings["command"]))}</pre>')
-    parts.append('<dl class="tiles">')
-    parts += [f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>" for label, value in tiles]
-    return "\n".join([*parts, "</dl>", "</header>"])
-
-
-def _gates(gates: Sequence[Gate]) -> str:
-    rows = []
-    for gate in gates:
-        badge = '<span class="badge passed">✓ yes</span>' if gate.passed else '<span class="badge failed">✗ no</span>'
-        rows.append(
-            f'<tr><th scope="row">{escape(gate.name)}</th><td class="number">{_number(gate.measured)}</td>'
-            f'<td class="number">{escape(gate.required)}</td><td class="number">{badge}</td></tr>'
-        )
-    head = _head("gate", ("measured", "required", "passed"))
-    return f'<h2>Gates</h2>\n<div class="card scroll"><table>{head}<tbody>\n{_lines(rows)}</tbody></table></div>'
 
 
 def _comparison(comparison: Comparison) -> str:
@@ -148,10 +116,10 @@ def _curves(comparison: Comparison) -> str:
             svg = panel_svg(partial(draw_panel, comparison=comparison, axis=axis, quantity=quantity))
             name = f"{comparison.name}-{quantity.label}-{axis.label}"
             label = f"{quantity.label} over {axis.label}: {comparison.title}"
-            charts.append(_chart(svg, name, label, PAGE_COLOURS | AGENT_COLOURS))
+            charts.append(chart_figure(svg, name, label, PAGE_COLOURS | AGENT_COLOURS))
     return (
-        f'<div class="card">\n<h3>Learning curves</h3>\n<ul class="legend column">\n{_lines(legend)}</ul>\n'
-        f'<div class="charts">\n{_lines(charts)}</div>\n'
+        f'<div class="card">\n<h3>Learning curves</h3>\n<ul class="legend column">\n{joined(legend)}</ul>\n'
+        f'<div class="charts">\n{joined(charts)}</div>\n'
         '<p class="muted">Thick lines: interquartile mean over seeds; bands: its 95 % bootstrap interval; thin lines: '
         f"single seeds; dashed: exact optimum. Running mean of {WINDOW} episodes. Lengths count decisions, as the "
         "paper does: an option is one action.</p>\n</div>"
@@ -165,9 +133,9 @@ def _results(comparison: Comparison) -> str:
         lines += _result_lines(list(group))
     seconds = "".join(f'<td class="number">{agent.seconds:,.1f}</td>' for agent in comparison.agents)
     lines.append(f'<tr class="group"><th scope="row">Training, all seeds</th><td>seconds</td>{seconds}</tr>')
-    head = _head("", [escape(agent.name) for agent in comparison.agents], second="")
+    head = table_head("", [escape(agent.name) for agent in comparison.agents], second="")
     return (
-        f'<div class="card">\n<h3>Results</h3>\n<div class="scroll"><table>{head}<tbody>\n{_lines(lines)}</tbody>'
+        f'<div class="card">\n<h3>Results</h3>\n<div class="scroll"><table>{head}<tbody>\n{joined(lines)}</tbody>'
         '</table></div>\n<p class="muted">Interquartile mean over seeds [95 % bootstrap interval]; a seed that did not '
         f"get there counts as ∞. Mean return: of the last {THRESHOLD_WINDOW} episodes of training.</p>\n</div>"
     )
@@ -195,11 +163,11 @@ def _pretraining(options: Sequence[OptionRun]) -> str:
         cells = "".join(f'<td class="number">{number}</td>' for number in numbers)
         rows.append(f'<tr><th scope="row">{escape(option.name)}</th>{cells}</tr>')
     columns = ("success", "mean steps", "best policy's mean steps", "starts", "training decisions", "seconds")
-    head = _head("option", columns)
+    head = table_head("option", columns)
     return (
         '<div class="card">\n<h3>Pretraining of the options</h3>\n<p class="muted">Judged from every start of the '
         "option's task, beside the policy with the best possible return.</p>\n"
-        f'<div class="scroll"><table>{head}<tbody>\n{_lines(rows)}</tbody></table></div>\n</div>'
+        f'<div class="scroll"><table>{head}<tbody>\n{joined(rows)}</tbody></table></div>\n</div>'
     )
 
 
@@ -213,34 +181,22 @@ def _usage(comparison: Comparison) -> str:
             f'<li><span class="swatch" style="background: {colour}"></span>{escape(name)}</li>'
             for name, colour in zip(agent.option_names, colours, strict=True)
         )
-        chart = _chart(svg, f"{comparison.name}-usage-{number}", label, PAGE_COLOURS)
+        chart = chart_figure(svg, f"{comparison.name}-usage-{number}", label, PAGE_COLOURS)
         charts.append(f'<div><h3>{escape(agent.name)}</h3>{chart}<ul class="legend">{legend}</ul></div>')
     return (
         '<div class="card">\n<h3>Options used during training</h3>\n<p class="muted">Share of decisions, mean over '
-        f'seeds; primitive actions in grey.</p>\n<div class="charts">\n{_lines(charts)}</div>\n</div>'
+        f'seeds; primitive actions in grey.</p>\n<div class="charts">\n{joined(charts)}</div>\n</div>'
     )
 
 
-def _settings(settings: Mapping[str, object]) -> str:
-    rows = [
-        f'<tr><th scope="row">{escape(name)}</th><td>{escape(str(value))}</td></tr>'
-        for name, value in _flatten({key: value for key, value in settings.items() if key not in HEADLINE})
-    ]
-    if not rows:
-        return ""
-    return (
-        f'<h2>Settings</h2>\n<div class="card"><details><summary>{len(rows)} settings</summary>'
-        f'<div class="scroll"><table><tbody>\n{_lines(rows)}</tbody></table></div></details></div>'
-    )
-
-
-def _flatten(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Settings within settings get dotted names."""
-    for key, value in json_safe(settings).items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+def _estimate(summary: Summary) -> str:
+    """The estimate, its interval, and how many seeds have a number, if not all."""
+    if summary.reached == 0:
+        return "not reached"
+    text = interval_text(summary.iqm, summary.low, summary.high)
+    if summary.reached < summary.seeds:
+        text += f'<small class="count">{summary.reached} of {summary.seeds} seeds</small>'
+    return text
 
 
 # -------------------------------------------------------------------------------------------------------- the player
@@ -304,57 +260,3 @@ def _data_uri(picture: UInt8[np.ndarray, "height width 3"]) -> str:
     content = BytesIO()
     Image.fromarray(picture).save(content, format="PNG", optimize=True)
     return f"data:image/png;base64,{b64encode(content.getvalue()).decode()}"
-
-
-# ----------------------------------------------------------------------------------------------------- small pieces
-
-
-def _chart(svg: str, name: str, label: str, colours: Mapping[str, str]) -> str:
-    """An SVG fit to stand in a page beside others: with ids of its own, without addresses, some colours replaced."""
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r' xmlns(:\w+)?="[^"]*"', "", svg)
-    prefix = re.sub(r"\W+", "-", name)
-    svg = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{prefix}-", svg)
-    for colour, variable in colours.items():
-        svg = svg.replace(colour, variable)
-    svg = svg.replace("<svg", f'<svg role="img" aria-label="{escape(label)}"', 1)
-    return f"<figure>{svg}</figure>"
-
-
-def _head(first: str, others: Sequence[str], second: str | None = None) -> str:
-    """A table's head: one or two columns of text, then columns of numbers."""
-    texts = [first] if second is None else [first, second]
-    cells = [f'<th scope="col">{text}</th>' if text else "<td></td>" for text in texts]
-    cells += [f'<th scope="col" class="number">{text}</th>' for text in others]
-    return f"<thead><tr>{''.join(cells)}</tr></thead>"
-
-
-def _lines(parts: Sequence[str]) -> str:
-    return "".join(f"{part}\n" for part in parts)
-
-
-def _estimate(summary: Summary) -> str:
-    """The estimate, its interval, and how many seeds have a number, if not all."""
-    if summary.reached == 0:
-        return "not reached"
-    text = f"{_number(summary.iqm)} <small>[{_number(summary.low)}, {_number(summary.high)}]</small>"
-    if summary.reached < summary.seeds:
-        text += f'<small class="count">{summary.reached} of {summary.seeds} seeds</small>'
-    return text
-
-
-def _number(value: float) -> str:
-    if math.isnan(value):
-        return "not measured"
-    if math.isinf(value):
-        return "∞" if value > 0 else "\u2212∞"
-    text = f"{value:,.0f}" if abs(value) >= 1000 or value == round(value) else f"{value:,.3g}"
-    return text.replace("-", "\u2212")  # a minus sign rather than a hyphen
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"
