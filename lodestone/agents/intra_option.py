@@ -24,14 +24,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND
+from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
 from lodestone.envs.base import Environment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import epsilon_greedy, mask_unavailable
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Chance, Rules, start_actor, tick
+from lodestone.options.execution import Actor, Rules, deal, start_actor, tick
 from lodestone.options.tabular import on_numbers
 from lodestone.planning.enumerated import enumerated
 from lodestone.planning.interruption import refuse_caps
@@ -126,6 +126,7 @@ def intra_option_q_learning(
     tables = tabulate(environment)
     world = enumerated(tables, environment.action_names)
     numbered = on_numbers(options, tables.space)
+    needed = needed_chance(world, numbered)
     one_step = np.array(options.max_steps) == 1
     if config.behaviour == "primitives":
         chosen_from = tabulate_options(options, tables.space)
@@ -147,14 +148,14 @@ def intra_option_q_learning(
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         noise_key, key = jax.random.split(carry.key)
 
-        def step(carry: tuple[Values, Actor], noise: Float[Array, "6"]) -> tuple[tuple[Values, Actor], tuple]:
+        def step(carry: tuple[Values, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Values, Actor], tuple]:
             values, actor = carry
             state = actor.state
             available = numbered.initiation(state)
             if config.behaviour == "primitives":
                 available &= jnp.asarray(one_step)
             choice = epsilon_greedy(noise[:2], values.table[state], available, epsilon)
-            actor, decision = tick(world, numbered, rules, Chance(*noise[2:]), actor, choice)
+            actor, decision = tick(world, numbered, rules, deal(noise[2:], needed), actor, choice)
 
             next_state = decision.transition.next_obs
             next_values = values.table[next_state]
@@ -168,7 +169,7 @@ def intra_option_q_learning(
             values, loss = update(values, state, decision.action, weights, target, learning_rate)
             return (values, actor), (decision, loss)
 
-        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + len(Chance._fields)))
+        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
         (values, actor), (decisions, losses) = jax.lax.scan(step, (carry.values, carry.actor), noise)
         return Carry(values, actor, key), log_round(decisions, jnp.mean(losses))
 

@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND
+from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
 from lodestone.envs.base import Environment
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options, Primitives
-from lodestone.options.execution import Actor, Chance, Rules, start_actor, tick
+from lodestone.options.execution import Actor, Rules, deal, start_actor, tick
 from lodestone.options.tabular import on_numbers
 from lodestone.planning.enumerated import enumerated
 from lodestone.planning.interruption import refuse_caps
@@ -92,7 +92,8 @@ def option_model_learning(
     tables = tabulate(environment)
     world = enumerated(tables, environment.action_names)
     numbered = on_numbers(options, tables.space)
-    actions = Primitives(environment.action_names)
+    actions = on_numbers(Primitives(environment.action_names), tables.space)
+    needed = needed_chance(world, actions)
     one_step = jnp.asarray([cap == 1 for cap in options.max_steps])
 
     def init(key: PRNGKeyArray) -> Carry:
@@ -107,11 +108,11 @@ def option_model_learning(
         action_key, noise_key, key = jax.random.split(carry.key, 3)
 
         def step(
-            carry: tuple[Models, Actor], draws: tuple[Int[Array, ""], Float[Array, "4"]]
+            carry: tuple[Models, Actor], draws: tuple[Int[Array, ""], Float[Array, " N"]]
         ) -> tuple[tuple[Models, Actor], tuple]:
             (models, actor), (action, noise) = carry, draws
             state = actor.state
-            actor, decision = tick(world, actions, rules, Chance(*noise), actor, action)
+            actor, decision = tick(world, actions, rules, deal(noise, needed), actor, action)
             next_state = decision.transition.next_obs
             reward = world.reward(state, action, next_state)
             stops = jnp.where(one_step | decision.terminated, 1.0, numbered.termination(next_state))
@@ -121,7 +122,7 @@ def option_model_learning(
 
         draws = (
             jax.random.randint(action_key, (STEPS_PER_ROUND,), 0, actions.size),
-            jax.random.uniform(noise_key, (STEPS_PER_ROUND, len(Chance._fields))),
+            jax.random.uniform(noise_key, (STEPS_PER_ROUND, sum(needed))),
         )
         (models, actor), (decisions, losses) = jax.lax.scan(step, (carry.models, carry.actor), draws)
         return Carry(models, actor, key), log_round(decisions, jnp.mean(losses))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.envs.base import Environment
@@ -20,8 +21,8 @@ from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import semi_markov_target
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Chance, Decision, Rules, start_actor, tick
-from lodestone.options.tabular import on_numbers
+from lodestone.options.execution import Actor, Chance, Decision, Rules, deal, start_actor, tick
+from lodestone.options.tabular import TabularOptions, on_numbers
 from lodestone.planning.enumerated import Enumerated, enumerated
 from lodestone.planning.tables import tabulate
 
@@ -64,6 +65,21 @@ def update(
     return table.at[transition.obs, transition.action].add(learning_rate * error), jnp.square(error)
 
 
+def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...]:
+    """For each field of `Chance`, whether a tick needs it: drawing them takes a good part of a learner's time."""
+
+    def draws(probs: Array) -> bool:
+        return bool(((np.asarray(probs) > 0) & (np.asarray(probs) < 1)).any())
+
+    needed = {
+        "action": draws(options.policy_table),
+        "termination": draws(options.termination_table),
+        "outcome": draws(world.probs),
+        "restart": len(world.initial_states) > 1,
+    }
+    return tuple(needed[field] for field in Chance._fields)
+
+
 def q_learning(
     config: QLearningConfig, environment: Environment, options: Options, rules: Rules, steps: int
 ) -> Algorithm:
@@ -78,9 +94,10 @@ def q_learning(
 
 
 def q_learning_on_numbers(
-    config: QLearningConfig, world: Enumerated, options: Options, rules: Rules, steps: int
+    config: QLearningConfig, world: Enumerated, options: TabularOptions, rules: Rules, steps: int
 ) -> Algorithm:
     """The same in a world of numbered states, with options on these numbers."""
+    needed = needed_chance(world, options)
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
@@ -93,16 +110,16 @@ def q_learning_on_numbers(
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         noise_key, key = jax.random.split(carry.key)
 
-        def step(carry: tuple[Array, Actor], noise: Float[Array, "6"]) -> tuple[tuple[Array, Actor], tuple]:
+        def step(carry: tuple[Array, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Array, Actor], tuple]:
             table, actor = carry
             available = options.initiation(actor.state)
             choice = epsilon_greedy(noise[:2], table[actor.state], available, epsilon)
-            actor, decision = tick(world, options, rules, Chance(*noise[2:]), actor, choice)
+            actor, decision = tick(world, options, rules, deal(noise[2:], needed), actor, choice)
             table, loss = update(table, decision, learning_rate)
             return (table, actor), (decision, loss)
 
         # Random numbers are drawn for all steps together: one by one they would take longer than the steps.
-        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + len(Chance._fields)))
+        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
         (table, actor), (decisions, losses) = jax.lax.scan(step, (carry.table, carry.actor), noise)
         return Carry(table, actor, key), log_round(decisions, jnp.mean(losses))
 

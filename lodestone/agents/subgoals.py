@@ -11,7 +11,7 @@ from lodestone.learning.loop import train
 from lodestone.options.base import Primitives
 from lodestone.options.execution import Rules
 from lodestone.options.subgoals import Subgoal, as_options, subproblem
-from lodestone.options.tabular import TabularOptions
+from lodestone.options.tabular import TabularOptions, on_numbers
 from lodestone.planning.enumerated import enumerated
 from lodestone.planning.solve import greedy_choices
 from lodestone.planning.tables import Tables
@@ -31,10 +31,11 @@ def learn_subgoals(
 
     Raises what `subproblem` raises, and `Diverged`.
     """
+    actions = on_numbers(Primitives(action_names), tables.space)
     policies = []
     for subgoal in subgoals:
         world = enumerated(subproblem(tables, subgoal, rules.discount), action_names)
-        algorithm = q_learning_on_numbers(config, world, Primitives(action_names), rules, steps)
+        algorithm = q_learning_on_numbers(config, world, actions, rules, steps)
         rounds = -(-steps // STEPS_PER_ROUND)
         for carry, _ in train(algorithm, [seed], rounds, rounds):
             policies.append(greedy_choices(np.asarray(carry.table[0], dtype=np.float64)))

@@ -7,6 +7,7 @@ inside: nature's draw is the argument `outcome`. Time limits and resets belong t
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from typing import NamedTuple
 
@@ -75,11 +76,20 @@ class Step(NamedTuple):
     terminated: Bool[Array, ""]
 
 
+UNROLLED = 32
+"""Up to so many probabilities are summed one by one, which compiles to far faster code than a cumulative sum."""
+
+
 def inverse_cdf(probs: Float[Array, " K"], uniform: Float[Array, ""]) -> Int[Array, ""]:
     """The index that a uniform number in [0, 1) picks; one of probability zero is never picked.
 
     One number a draw, where a Gumbel draw would take K.
     """
+    if probs.shape[0] <= UNROLLED:
+        edges = list(itertools.accumulate(probs[index] for index in range(probs.shape[0])))
+        point = uniform * edges[-1]
+        # Summed in order, the edges never fall: those that lie below the point come before the first that does not.
+        return sum((edge <= point).astype(jnp.int32) for edge in edges[:-1]) + jnp.int32(0)
     # A cumulative sum rounds out of order, so that it may rise, or fall, where nothing was added.
     edges = jnp.where(probs > 0, jnp.cumsum(probs), 0.0)
     return jnp.argmax(edges > uniform * jnp.max(edges)).astype(jnp.int32)
@@ -92,12 +102,17 @@ def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Arra
 
 def initial_state(environment: Environment, uniform: Float[Array, ""]) -> State:
     """The first state of an episode that a uniform number in [0, 1) picks."""
-    probs, states = environment.initial_distribution()
-    if probs.shape[0] == 1:
+    with jax.ensure_compile_time_eval():
+        probs, states = environment.initial_distribution()
+    count = probs.shape[0]
+    if count == 1:
         return jax.tree.map(lambda leaf: leaf[0], states)
-    # There may be hundreds of states to begin in: a search by halves.
-    edges = jnp.cumsum(probs)
-    index = jnp.searchsorted(edges, uniform * edges[-1], side="right", method="scan_unrolled")
+    if not isinstance(probs, jax.core.Tracer) and np.all(np.asarray(probs) == np.asarray(probs)[0]):
+        index = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
+    else:
+        # There may be hundreds of states to begin in: a search by halves.
+        edges = jnp.cumsum(probs)
+        index = jnp.searchsorted(edges, uniform * edges[-1], side="right", method="scan_unrolled")
     return jax.tree.map(lambda leaf: leaf[index], states)
 
 

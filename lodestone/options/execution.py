@@ -124,6 +124,12 @@ def draw_chance(key: PRNGKeyArray) -> Chance:
     return Chance(action, termination, outcome, restart)
 
 
+def deal(uniform: Float[Array, " N"], needed: tuple[bool, ...]) -> Chance:
+    """The random numbers of one tick out of N, where `needed` tells for each field of `Chance` whether it takes one."""
+    numbers = iter(uniform)
+    return Chance(*(next(numbers) if wanted else jnp.float32(0) for wanted in needed))
+
+
 def tick(
     environment: Environment,
     options: Options,
