@@ -1,5 +1,7 @@
 """The sampler of nature's draws and of initial states."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lodestone.envs.base import example_state, inverse_cdf, sample_categorical, sample_initial, sample_step
+from lodestone.envs.base import (
+    example_state,
+    initial_state,
+    inverse_cdf,
+    sample_categorical,
+    sample_initial,
+    sample_step,
+)
+from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task
 
 
@@ -85,6 +95,17 @@ def test_initial_states_follow_their_probabilities() -> None:
     states = np.asarray(jax.vmap(lambda key: sample_initial(WindyWalk(), key))(keys))
     assert set(states) == {10, 30}
     assert abs(np.mean(states == 10) - 0.5) < 0.04
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_even_initial_states_share_the_unit_interval_evenly(compiled: bool) -> None:
+    rooms = FourRooms()
+    uniforms = jnp.asarray((np.arange(103 * 8) + 0.5) / (103 * 8), dtype=jnp.float32)
+    draw_start = jax.vmap(partial(initial_state, rooms))
+    cells = np.asarray((jax.jit(draw_start) if compiled else draw_start)(uniforms).cell)
+    np.testing.assert_array_equal(cells, np.repeat(np.delete(np.arange(104), rooms.goal), 8))
+    last = initial_state(rooms, jnp.float32(1 - 2.0**-24))
+    assert int(last.cell) == 103
 
 
 def test_example_state_is_the_first_initial_state() -> None:
