@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import pytest
+from fake_study import make_study
 
 from lodestone import __version__
 from lodestone.agents.playing import play
 from lodestone.agents.saved import load_policy
 from lodestone.cli import main
+from lodestone.errors import UnknownName
+from lodestone.experiments.registry import EXPERIMENTS, experiment
+from lodestone.experiments.study import Experiment, Study
+from lodestone.learning.progress import Progress
 from lodestone.options.base import NO_CAP
 from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
@@ -133,6 +139,87 @@ def test_scripts_are_capped_unless_the_agent_learns_within_options(capsys, tmp_p
         assert load_policy(tmp_path / agent / "policy.safetensors").options.max_steps[-1] == cap
 
 
+@pytest.fixture
+def invented(monkeypatch: pytest.MonkeyPatch) -> Experiment:
+    """An experiment that is known for the time of a test."""
+
+    def find(seeds: int, progress: Progress) -> Study:
+        progress.begin("inventing", 1.0)
+        progress.advance(1.0, "done")
+        return replace(make_study(20), seeds=seeds)
+
+    one = Experiment("fake", "An invented study", seeds=20, work=1.0, run=find)
+    monkeypatch.setitem(EXPERIMENTS, one.name, one)
+    return one
+
+
+def test_an_experiment_is_found_by_its_name(invented):
+    assert experiment("fake") is invented
+    with pytest.raises(UnknownName, match=r"no experiment named 'moon'; there are: .*fake"):
+        experiment("moon")
+
+
+def test_experiments_are_listed(invented, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(capsys, "reproduce", "--list")
+    assert code == 0
+    lines = out.splitlines()
+    assert lines[0].startswith("magnet-tower ")
+    assert lines[-1].split(maxsplit=1) == ["fake", "An invented study (20 seeds)"]
+    assert len(lines) == 1 + len(EXPERIMENTS)
+    code, out, _ = run(capsys, "reproduce", "--list", "--json")
+    rows = json.loads(out)
+    assert [row["name"] for row in rows] == ["magnet-tower", *EXPERIMENTS]
+    assert rows[-1] == {"name": "fake", "title": "An invented study", "seeds": 20}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_experiment_is_reproduced(invented, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = run(capsys, "reproduce", "--experiment", "fake")
+    assert code == 0  # also where a gate is missed
+    assert sorted(path.name for path in (tmp_path / "out" / "fake").iterdir()) == [
+        "fake-1.svg",
+        "fake.png",
+        "report.html",
+        "results.json",
+    ]
+    for expected in ("What must come out", "MISSED", "Learners", "14,000", "report.html", "results.json"):
+        assert expected in out
+    found = json.loads((tmp_path / "out" / "fake" / "results.json").read_text())
+    assert found["settings"]["command"] == "lodestone reproduce --experiment fake --seeds 20 --out out/fake"
+
+
+def test_an_experiment_prints_its_results_as_json(invented, capsys, tmp_path):
+    words = ["reproduce", "--experiment", "fake", "--seeds", "4", "--out", str(tmp_path / "new"), "--json"]
+    code, out, _ = run(capsys, *words)
+    found = json.loads(out)
+    assert code == 0
+    assert found == json.loads((tmp_path / "new" / "results.json").read_text())
+    assert found["seeds"] == 4
+    assert [gate["passed"] for gate in found["gates"]] == [True, True, False, False]
+
+
+def test_an_interrupted_experiment_leaves_no_files(invented, capsys, tmp_path, monkeypatch):
+    def interrupted(seeds: int, progress: Progress) -> Study:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(EXPERIMENTS, "fake", replace(invented, run=interrupted))
+    code, out, err = run(capsys, "reproduce", "--experiment", "fake", "--out", str(tmp_path / "new"))
+    assert (code, out) == (130, "")
+    assert "interrupted" in err
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.parametrize("choice", [["--figure", "2"], ["--preset", "paper"]])
+def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, tmp_path):
+    words = ["reproduce", "--experiment", "fake", *choice, "--out", str(tmp_path / "new")]
+    code, out, err = run(capsys, *words)
+    assert (code, out) == (2, "")
+    assert err == f"lodestone: {choice[0]} belongs to magnet-tower; fake has no such choice.\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 REFUSED = [
     (["nonsense"], "no command named 'nonsense'"),
     (["plan"], "needs the name of an environment"),
@@ -163,6 +250,7 @@ REFUSED = [
     (["reproduce", "--preset", "slow"], "slow"),
     (["reproduce", "--figure", "4"], "4"),
     (["reproduce", "--seeds", "0"], "seeds is 0"),
+    (["reproduce", "--experiment", "moon"], "no experiment named 'moon'; there are: magnet-tower"),
     (["watch", "nowhere"], "nowhere"),
 ]
 

@@ -75,6 +75,6 @@ class Experiment:
     seeds: int
     """How many by default."""
     work: float
-    """What `run` reports as progress in all, with so many seeds; any unit."""
+    """What `run` reports as progress in all, the same for any number of seeds; any unit."""
     run: Callable[[int, Progress], Study]
     """run(seeds, progress) -> what was found."""

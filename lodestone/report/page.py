@@ -20,6 +20,12 @@ HEADLINE = ("command", "seconds", "machine")
 PAGE_COLOURS = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)", PAPER: "var(--card)"}
 AGENT_COLOURS = {colour: f"var(--agent-{index})" for index, colour in enumerate(AGENTS)}
 """Colours of a figure that follow the page from light to dark. Those of options do not: text stands on them."""
+DRAWING_COLOURS = {
+    f'"{colour}"': f'"{variable}"'
+    for variable, colours in {"var(--ink)": ("black", "#000", "#000000"), "var(--card)": ("white", "#fff")}.items()
+    for colour in colours
+}
+"""What drawings that are not figures of ours use for ink and paper, as values of attributes."""
 
 
 def write_page(title: str, body: str, path: str | Path) -> None:

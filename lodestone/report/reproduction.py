@@ -22,6 +22,15 @@ from lodestone.report.html import write_report
 from lodestone.report.results import results_json
 
 
+def provenance(command: str) -> dict[str, object]:
+    """Settings that say where results come from: the command, the machine and the versions of what ran."""
+    return {
+        "command": command,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
+        "versions": f"lodestone {__version__}, jax {jax.__version__}, python {platform.python_version()}",
+    }
+
+
 class Reproduction:
     """What has finished so far, and its files."""
 
@@ -31,11 +40,9 @@ class Reproduction:
         self._started = perf_counter()
         self._trained: dict[str, Trained] = {}
         self._settings = {
-            "command": f"lodestone reproduce --figure {figure} --preset {preset} --seeds {seeds} --out {folder}",
+            **provenance(f"lodestone reproduce --figure {figure} --preset {preset} --seeds {seeds} --out {folder}"),
             "preset": preset,
             "seeds": seeds,
-            "machine": f"{platform.machine()}, {os.cpu_count()} cores, {jax.default_backend()}",
-            "versions": f"lodestone {__version__}, jax {jax.__version__}, python {platform.python_version()}",
         }
         self.files: list[str] = []
 

@@ -1,55 +1,16 @@
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_comparison import GATES, SETTINGS, make_comparison, make_playback
+from page_parser import HOSTILE, Page
 
 from lodestone.experiments.comparison import Comparison, Gate
 from lodestone.report.html import write_player, write_report
 from lodestone.report.results import agent_rows
-
-VOID = {"meta", "link", "img", "input", "br"}
-HOSTILE = "</script><script>alert('x')</script><img src=x onerror=\"alert(1)\"> & $body ${x}"
-
-
-class Page(HTMLParser):
-    """Checks that every element is closed in order, and collects what a page consists of."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[str] = []
-        self.attributes: list[tuple[str, str | None]] = []
-        self.texts: list[str] = []
-        self.scripts: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.attributes += attrs
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.attributes += attrs
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] == "script":
-            self.scripts.append(data)
-        else:
-            self.texts.append(data)
-
-    def values(self, name: str) -> list[str]:
-        return [value or "" for key, value in self.attributes if key == name]
 
 
 def report(path: Path, comparisons: list[Comparison], gates: tuple[Gate, ...] = GATES) -> tuple[str, Page]:
