@@ -182,7 +182,7 @@ def name_references(axes: Axes, panel: Panel, curves: Sequence[Curve]) -> None:
                         100 * sum(box.overlaps(other) for other in taken),
                         50 * (box.y0 < axes.bbox.y0 or box.y1 > axes.bbox.y1),
                         10 * len(crossed),
-                        *(box.count_contains(points) / len(points) for points in drawn),
+                        *(box.count_contains(points) / max(len(points), 1) for points in drawn),
                     )
                 )
                 if cost < lowest:
@@ -196,11 +196,12 @@ def name_references(axes: Axes, panel: Panel, curves: Sequence[Curve]) -> None:
 
 
 def _pixels(axes: Axes, curve: Curve) -> Float[np.ndarray, "points 2"]:
-    """The interquartile mean as points close to one another."""
+    """A curve as points: those of its seeds and, close to one another, those of its interquartile mean."""
     low, high = axes.get_ylim()
-    points = axes.transData.transform(np.stack([curve.x, curve.iqm.clip(low, high)], axis=1))
-    between = [np.linspace(start, end, 20) for start, end in pairwise(points[~np.isnan(points).any(axis=1)])]
-    return np.concatenate([*between, np.full((1, 2), -1.0)])
+    every = np.stack(np.broadcast_arrays(curve.x, curve.seeds.clip(low, high)), axis=-1)
+    mean = axes.transData.transform(np.stack([curve.x, curve.iqm.clip(low, high)], axis=1))
+    between = [np.linspace(start, end, 20) for start, end in pairwise(mean[~np.isnan(mean).any(axis=1)])]
+    return np.concatenate([axes.transData.transform(every.reshape(-1, 2)), *between])
 
 
 def _at_line(axes: Axes, name: str, value: float, side: str, below: bool) -> Annotation:

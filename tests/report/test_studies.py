@@ -109,6 +109,8 @@ def test_nothing_finite_is_drawn_without_a_warning() -> None:
     for value in (-np.inf, np.nan):
         panel = one_panel(series=(Series("a", X, np.full((4, 1000), value)),), y_range=None)
         assert drawn(panel).lines
+    nowhere = Series("a", np.zeros(3), np.ones((4, 3)))
+    assert drawn(one_panel(series=(nowhere,), log_x=True)).lines
 
 
 def test_references_are_named_beside_one_another() -> None:
