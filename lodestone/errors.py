@@ -26,6 +26,10 @@ class InvalidTaskGraph(LodestoneError):
     """Subtasks that call what does not exist, call one another in a circle, or get stuck."""
 
 
+class InvalidMachine(LodestoneError):
+    """An abstract machine that names what does not exist, runs on without taking time, calls itself, or gets stuck."""
+
+
 class BadFile(LodestoneError):
     """A file that is missing, truncated, foreign, or saved for another problem."""
 
