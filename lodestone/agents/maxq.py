@@ -16,6 +16,7 @@ The recursion is unrolled into small events, one at a time in every seed: call a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -314,12 +315,14 @@ def as_configured(config: MAXQConfig, graph: TaskGraph) -> TaskGraph:
     return graph if config.pseudo_rewards else graph.without_pseudo_rewards()
 
 
-def greedy_choices(
-    config: MAXQConfig, environment: Environment, graph: TaskGraph, learned: Learned
-) -> Int[np.ndarray, "T S"]:
-    """The edge that each subtask takes in each state by what one seed has learned; -1 where it has ended."""
-    tasks, values = _everywhere(config, environment, graph, learned)
-    return np.where(tasks.ends, -1, np.asarray(values.choices).T)
+def chooser(
+    config: MAXQConfig, environment: Environment, graph: TaskGraph
+) -> Callable[[Learned], Int[np.ndarray, "N T S"]]:
+    """A function from what N seeds have learned to the edge that each subtask takes in each state; -1 where it has
+    ended. Compiled once."""
+    tasks, everywhere = _everywhere(config, environment, graph)
+    ask = jax.jit(jax.vmap(everywhere))
+    return lambda learned: np.where(tasks.ends, -1, np.asarray(ask(learned).choices).swapaxes(1, 2))
 
 
 def polled_values(
@@ -328,7 +331,8 @@ def polled_values(
     """What one seed expects of each primitive action where every step asks anew from the root down: the rewards and
     completions along the best path to the action, -inf where there is none. Its maximum is the action that polling
     takes, also where pseudo-rewards choose another path than the best."""
-    tasks, values = _everywhere(config, environment, graph, learned)
+    tasks, everywhere = _everywhere(config, environment, graph)
+    values = jax.jit(everywhere)(jax.tree.map(jnp.asarray, learned))
     states = np.arange(tasks.ends.shape[1])
     slots = tasks.completion_slot
     completions = np.where(slots >= 0, np.asarray(learned.values)[slots], 0.0)
@@ -349,15 +353,19 @@ def polled_values(
 
 
 def _everywhere(
-    config: MAXQConfig, environment: Environment, graph: TaskGraph, learned: Learned
-) -> tuple[TaskTables, Values]:
-    """What is known about every state."""
+    config: MAXQConfig, environment: Environment, graph: TaskGraph
+) -> tuple[TaskTables, Callable[[Learned], Values]]:
+    """The tasks, and a function from what one seed has learned to what it knows about every state."""
     tables = tabulate(environment)
     tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    values = jnp.asarray(learned.values)
-    learned = Learned(values, jnp.asarray(learned.inner) if learned.inner.size else values)
-    ask = jax.jit(jax.vmap(partial(values_at, tasks, on_device(tasks), learned)))
-    return tasks, ask(jnp.arange(tables.num_states))
+    arrays = on_device(tasks)
+
+    def everywhere(learned: Learned) -> Values:
+        if not learned.inner.size:
+            learned = Learned(learned.values, learned.values)
+        return jax.vmap(partial(values_at, tasks, arrays, learned))(jnp.arange(tables.num_states))
+
+    return tasks, everywhere
 
 
 def rounds_for(graph: TaskGraph, steps: int) -> int:

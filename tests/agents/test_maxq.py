@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from lodestone.agents.maxq import Learned, MAXQConfig, as_configured, greedy_choices, maxq, polled_values, rounds_for
+from lodestone.agents.maxq import Learned, MAXQConfig, as_configured, chooser, maxq, polled_values, rounds_for
 from lodestone.envs.base import Environment
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
@@ -45,8 +45,8 @@ def test_two_rooms(pseudo_rewards, all_states):
     seeds, _ = learn(config, rooms, Rules(discount=1.0, step_limit=50), 60_000)
     tables = tabulate(rooms)
     tasks = tabulate_tasks(as_configured(config, task_graph(rooms)), rooms, tables)
-    for learned in seeds:
-        choices = greedy_choices(config, rooms, task_graph(rooms), learned)
+    together = Learned(*(np.stack(leaves) for leaves in zip(*seeds, strict=True)))
+    for choices in chooser(config, rooms, task_graph(rooms))(together):
         found = evaluate_choices(tasks, tables, choices).values[0]
         assert tables.initial_mean(found) == pytest.approx(-7.75 if pseudo_rewards else -8.5)
 
