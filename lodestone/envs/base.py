@@ -86,10 +86,10 @@ def inverse_cdf(probs: Float[Array, " K"], uniform: Float[Array, ""]) -> Int[Arr
     One number a draw, where a Gumbel draw would take K.
     """
     if probs.shape[0] <= UNROLLED:
-        edges = list(itertools.accumulate(probs[index] for index in range(probs.shape[0])))
-        point = uniform * edges[-1]
-        # Summed in order, the edges never fall: those that lie below the point come before the first that does not.
-        return sum((edge <= point).astype(jnp.int32) for edge in edges[:-1]) + jnp.int32(0)
+        sums = list(itertools.accumulate(probs[index] for index in range(probs.shape[0])))
+        point = uniform * sums[-1]
+        # Summed in order, they never fall: those that lie below the point come before the first that does not.
+        return sum((edge <= point).astype(jnp.int32) for edge in sums[:-1]) + jnp.int32(0)
     # A cumulative sum rounds out of order, so that it may rise, or fall, where nothing was added.
     edges = jnp.where(probs > 0, jnp.cumsum(probs), 0.0)
     return jnp.argmax(edges > uniform * jnp.max(edges)).astype(jnp.int32)

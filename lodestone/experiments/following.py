@@ -58,7 +58,8 @@ def follow(
         tell(min(1.0, taken.min() / steps), f"greedy policies worth {np.mean(judged):.2f}")
         if taken.min() >= steps:
             break
-    return Followed(history, *(np.stack(column) for column in zip(*looked, strict=True)), carry, history.seconds)
+    episodes, steps_taken, judged = (np.stack(column) for column in zip(*looked, strict=True))
+    return Followed(history, episodes, steps_taken, judged, carry, history.seconds)
 
 
 def return_within(tables: Tables, policies: Int[np.ndarray, "N S"], steps: int) -> Float[np.ndarray, " N"]:

@@ -34,7 +34,7 @@ JUDGED_STEPS = 50
 
 ABSTRACT, WHOLE, FLAT = "MAXQ-Q, abstraction", "MAXQ-Q, whole states", "Q-learning, flat"
 EPSILON = ((0.0, 0.3), (0.8, 0.3), (1.0, 0.02))
-CONFIGS = {
+CONFIGS: dict[str, MAXQConfig | QLearningConfig] = {
     ABSTRACT: MAXQConfig(learning_rate=((0.0, 0.25),), epsilon=EPSILON),
     WHOLE: MAXQConfig(learning_rate=((0.0, 0.5),), epsilon=EPSILON, abstraction=False),
     FLAT: QLearningConfig(learning_rate=((0.0, 0.5),), epsilon=EPSILON),
