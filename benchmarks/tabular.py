@@ -5,8 +5,8 @@
 
 Option Q-learning makes one update an option execution, intra-option Q-learning one for every option that would have
 taken the step. Lodestone trains a batch of seeds on all cores, its log of every decision included. The plain loop is
-the same learner for one seed on one core, in Python with NumPy; its row for all cores is that number times the cores: more
-than any worker processes could reach. Both count the updates that they make.
+the same learner for one seed on one core, in Python with NumPy; its row for all cores is that number times the cores,
+which no worker processes could exceed. Both count the updates that they make.
 """
 
 from __future__ import annotations
