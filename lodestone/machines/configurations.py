@@ -297,8 +297,13 @@ def _check_vertex(where: str, vertex: Vertex, machine: Machine, machines: dict[s
             for label, _ in pairs(only_if):
                 if label not in dict(pairs(edges)):
                     raise InvalidMachine(f"{where} has a predicate for {label!r}, which is none of its edges.")
-        case Branch(_, edges):
-            _check_labels(where, [label for label, _ in pairs(edges)])
+        case Branch(_, answers):
+            labels = [label for label, _ in pairs(answers)]
+            _check_labels(where, labels)
+            if not all(isinstance(label, int) for label in labels):
+                raise InvalidMachine(
+                    f"The labels of a branch are bools or integers, but {where} has {_listed(labels)}."
+                )
     for argument in _arguments(vertex):
         if isinstance(argument, Parameter) and argument.name not in machine.parameters:
             raise InvalidMachine(f"{where} uses {argument.name!r}, which is no parameter of machine {machine.name!r}.")
@@ -356,5 +361,5 @@ def _names(machines: tuple[Machine, ...]) -> str:
     return ", ".join(repr(machine.name) for machine in machines)
 
 
-def _listed(names: Iterable[str]) -> str:
+def _listed(names: Iterable[object]) -> str:
     return ", ".join(map(str, names)) or "no arguments"
