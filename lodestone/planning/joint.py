@@ -28,7 +28,13 @@ from lodestone.envs.base import Environment
 from lodestone.errors import InvalidMachine, LodestoneError, TooManyStates
 from lodestone.machines.configurations import END, Configurations, check, configurations, takes_time
 from lodestone.machines.machine import Action, Branch, Choice, Hierarchy, Predicate, pairs
-from lodestone.planning.solve import check_discount, iterate_values, optimal_choices, solve_chain
+from lodestone.planning.solve import (
+    check_discount,
+    factorise,
+    iterate_values,
+    optimal_choices,
+    solve_chain,
+)
 from lodestone.planning.tables import Tables, state_batches, state_text, tabulate
 from lodestone.types import State
 
@@ -189,6 +195,24 @@ def expected_choices(
 ) -> Float[np.ndarray, " J"]:
     """Expected choices [J] of a policy until the episode ends; inf where it may go on for ever."""
     return 0.0 - _evaluate(process, policy, 1.0, np.zeros(len(process.actions)), choice_reward=-1.0)
+
+
+def expected_visits(
+    process: JointProcess, policy: Int[np.ndarray, " N"] | Float[np.ndarray, "N U"]
+) -> Float[np.ndarray, "N U"]:
+    """How often a policy takes each edge in an episode, expected.
+
+    Raises `LodestoneError` where it may go on for ever, and where it takes an edge that may not be taken.
+    """
+    steps_left = expected_joint_steps(process, policy)
+    if not np.isfinite(process.initial_mean(steps_left)):
+        raise LodestoneError("The policy may go on for ever, so it takes some edges without end.")
+    weights, steps = _chain(process, policy, 1.0)
+    # What is not reached may go on for ever, and is left out; nothing follows the end.
+    followed = np.isfinite(steps_left) & (np.arange(process.num_states) != process.end)
+    going_on = sparse.diags_array(followed.astype(np.float64)) @ steps
+    visits = factorise(going_on).solve(process.initial_probs, "T")
+    return visits[: process.num_choices, None] * weights
 
 
 def hierarchical_optimum(environment: Environment, hierarchy: Hierarchy, discount: float = 0.99) -> HierarchicalOptimum:
@@ -473,6 +497,21 @@ def _evaluate(
     choice_reward: float,
 ) -> Float[np.ndarray, " J"]:
     check_discount(discount)
+    _, steps = _chain(process, policy, discount)
+    going = np.arange(process.num_states) != process.end
+    ends = np.asarray(steps @ (~going).astype(np.float64)) > 0
+    ends[process.end] = True
+    going_on = steps @ sparse.diags_array(going.astype(np.float64))
+    going_on.eliminate_zeros()
+    rewards = np.concatenate([np.full(process.num_choices, choice_reward), step_rewards, [0.0]])
+    return solve_chain(going_on, rewards, ends if discount == 1 else None)
+
+
+def _chain(
+    process: JointProcess, policy: Int[np.ndarray, " N"] | Float[np.ndarray, "N U"], discount: float
+) -> tuple[Float[np.ndarray, "N U"], sparse.csr_array]:
+    """The policy as probabilities, and what follows each joint state under it, [J, J], discounted where time passes;
+    nothing follows the end."""
     num_choices, width = process.edges.shape
     weights = np.eye(width)[policy] if policy.ndim == 1 else policy.astype(np.float64)
     if (weights[~process.available] > 0).any():
@@ -482,13 +521,7 @@ def _evaluate(
     last = sparse.csr_array((1, process.num_states))
     steps = sparse.vstack([choosing, discount * _action_matrix(process), last], format="csr")
     steps.sum_duplicates()
-    going = np.arange(process.num_states) != process.end
-    ends = np.asarray(steps @ (~going).astype(np.float64)) > 0
-    ends[process.end] = True
-    going_on = steps @ sparse.diags_array(going.astype(np.float64))
-    going_on.eliminate_zeros()
-    rewards = np.concatenate([np.full(num_choices, choice_reward), step_rewards, [0.0]])
-    return solve_chain(going_on, rewards, ends if discount == 1 else None)
+    return weights, steps
 
 
 def _action_matrix(process: JointProcess) -> sparse.csr_array:
