@@ -24,6 +24,7 @@ benchmarks: .venv/installed
 	$(BIN)/python -m pip install -c constraints.txt -e '.[benchmarks]'
 	$(BIN)/python benchmarks/environment.py
 	$(BIN)/python benchmarks/tabular.py
+	$(BIN)/python benchmarks/hierarchies.py
 	$(BIN)/python benchmarks/training.py
 
 # The stamp is newer than what it was installed from, so a change of dependencies installs again.

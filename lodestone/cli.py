@@ -23,11 +23,11 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from lodestone import __version__
 from lodestone.agents.intra_option import IntraOptionConfig
-from lodestone.agents.playing import play, record
+from lodestone.agents.playing import episodes_to_judge, play_many, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.run_folder import POLICY, RunFolder
 from lodestone.agents.saved import load_options, load_policy, save_options
-from lodestone.agents.training import AGENTS, AgentConfig, train_policy
+from lodestone.agents.training import AGENTS, AgentConfig, check_training, train_policy
 from lodestone.console import ConsoleProgress
 from lodestone.devices import use_all_cores
 from lodestone.envs.base import Environment
@@ -282,6 +282,7 @@ def _train(train: Train, agent: str) -> None:
         raise InvalidConfig(f"steps is {train.steps}, but must be at least 1.")
     environment, rules = train.environment, train.rules
     options = _choose_options(train)
+    check_training(train.agent, environment, options, rules)
     seeds = tuple(range(train.seed, train.seed + train.seeds))
     folder = None
     if train.out is not None:
@@ -314,7 +315,8 @@ def _train(train: Train, agent: str) -> None:
         best = optimum(environment)
     except TooManyStates:
         best = None
-    greedy = play(policy, jax.random.key(0))
+    judged = episodes_to_judge(environment)
+    greedy = jax.tree.map(lambda leaf: leaf.mean(axis=1), play_many(policy, jax.random.key(0), judged))
     content: dict[str, Any] = {
         "agent": agent,
         "environment": describe_environment(environment),
@@ -327,20 +329,22 @@ def _train(train: Train, agent: str) -> None:
                 "steps": history.taken(position)[1],
                 "episodes": len(history.episodes(position).total_reward),
                 "greedy_return": float(greedy.total_reward[position]),
-                "greedy_steps": int(greedy.steps[position]),
-                "greedy_decisions": int(greedy.decisions[position]),
-                "success": bool(greedy.success[position]),
+                "greedy_steps": float(greedy.steps[position]),
+                "greedy_decisions": float(greedy.decisions[position]),
+                "success": float(greedy.success[position]),
                 "gap": best.optimal_return - float(greedy.total_reward[position]) if best else None,
             }
             for position, seed in enumerate(seeds)
         ],
+        "greedy_episodes": judged,
         "seconds": round(history.seconds, 3),
         "out": str(train.out) if train.out else None,
     }
     if train.json:
         _print_json(content)
         return
-    table = Table(title=f"Greedy policies after training ({history.seconds:.0f} s)", title_justify="left")
+    title = f"Greedy policies after training ({history.seconds:.0f} s)"
+    table = Table(title=title if judged == 1 else f"{title}, means of {judged} episodes", title_justify="left")
     for column in ("seed", "steps trained", "return", "optimal return", "steps", "decisions", "reached the goal"):
         table.add_column(column, justify="right")
     for row in content["seeds"]:
@@ -349,9 +353,9 @@ def _train(train: Train, agent: str) -> None:
             f"{row['steps']:,}",
             f"{row['greedy_return']:g}",
             f"{best.optimal_return:g}" if best else "unknown",
-            str(row["greedy_steps"]),
-            str(row["greedy_decisions"]),
-            "yes" if row["success"] else "no",
+            f"{row['greedy_steps']:g}",
+            f"{row['greedy_decisions']:g}",
+            f"{row['success']:.0%}",
         )
     Console().print(table)
     if train.out is not None:

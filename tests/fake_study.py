@@ -1,11 +1,16 @@
-"""An invented study that looks like a real one: two panels of three learners, twenty seeds, tables, a drawing."""
+"""An invented study that looks like a real one: two panels of three learners, twenty seeds, tables, a machine."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import numpy as np
 from fake_comparison import GATES
 
-from lodestone.experiments.study import NumberTable, Panel, Series, Study
+from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.experiments.study import LearnedMachines, NumberTable, Panel, Series, Study
+from lodestone.machines.magnet_arm import pull_up
+from lodestone.planning.joint import expected_visits, joint_process
 
 SEEDS = 20
 OPTIMUM, RECURSIVE = 7.93, 7.1
@@ -64,19 +69,14 @@ def make_study(points: int = 400) -> Study:
         panels=tuple(panels),
         tables=(table,),
         gates=GATES,
-        drawings=(("A machine of two states", MACHINE),),
+        machines=(learned_machines(),),
     )
 
 
-MACHINE = """<?xml version="1.0" encoding="UTF-8"?>
-<svg xmlns="http://www.w3.org/2000/svg" width="360" height="140" viewBox="0 0 360 140">
-<defs><marker id="tip" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="8" markerHeight="8" orient="auto">
-<path d="M0 0 8 4 0 8z" fill="#1f2933"/></marker></defs>
-<circle cx="70" cy="70" r="36" fill="#ffffff" stroke="black" stroke-width="2"/>
-<circle cx="290" cy="70" r="36" fill="none" stroke="#0072b2" stroke-width="2"/>
-<text x="70" y="75" text-anchor="middle" font-size="14">search</text>
-<text x="290" y="75" text-anchor="middle" font-size="14" fill="#0072b2">carry</text>
-<path d="M108 70H250" stroke="#1f2933" fill="none" marker-end="url(#tip)"/>
-<text x="180" y="62" text-anchor="middle" font-size="12">found</text>
-</svg>
-"""
+@cache
+def learned_machines() -> LearnedMachines:
+    """The pull-up machine on a small arm, every edge taken as often as any other."""
+    arm = MagnetArm(rows=3, columns=2, bricks=2, tower_height=2)
+    process = joint_process(arm, pull_up(arm))
+    anything = process.available / process.available.sum(axis=1, keepdims=True)
+    return LearnedMachines("The pull-up machine", process, expected_visits(process, anything))

@@ -11,7 +11,7 @@ import pytest
 from fake_study import make_study
 
 from lodestone import __version__
-from lodestone.agents.playing import play
+from lodestone.agents.playing import play_many
 from lodestone.agents.saved import load_policy
 from lodestone.cli import main
 from lodestone.errors import UnknownName
@@ -120,13 +120,13 @@ def test_hallway_options_are_trained_with_saved_and_watched(agent, capsys, tmp_p
     code, out, _ = run(capsys, *words, "--steps", "60000", "--out", str(tmp_path / "run"), "--json")
     found = json.loads(out)
     assert code == 0
-    assert [row["success"] for row in found["seeds"]] == [True, True]
+    assert [row["success"] for row in found["seeds"]] == [1.0, 1.0]
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
     assert policy.agent == agent
     assert policy.options.names[4:] == HALLWAY_OPTIONS
     assert policy.options.max_steps == (1,) * 4 + (NO_CAP,) * 8
-    again = play(policy, jax.random.key(0))
-    assert again.steps.tolist() == [row["greedy_steps"] for row in found["seeds"]]
+    again = play_many(policy, jax.random.key(0), found["greedy_episodes"])
+    assert again.steps.mean(axis=1).tolist() == [row["greedy_steps"] for row in found["seeds"]]
     code, out, _ = run(capsys, "watch", str(tmp_path / "run"))
     assert code == 0
     assert "step   1:" in out
@@ -220,6 +220,32 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("agent", "environment", "steps"),
+    [
+        ("maxq", ["taxi", "--step-limit", "200", "--discount", "1"], "40000"),
+        ("maxq", ["two-rooms"], "30000"),
+        ("hamq", ["magnet-arm", *TINY], "20000"),
+        ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
+    ],
+)
+def test_hierarchies_are_trained_saved_and_watched(agent, environment, steps, capsys, tmp_path):
+    run_folder = str(tmp_path / "run")
+    code, out, _ = run(
+        capsys, "train", agent, *environment, "--steps", steps, "--seeds", "2", "--json", "--out", run_folder
+    )
+    found = json.loads(out)
+    assert code == 0
+    assert all(row["success"] > 0.9 for row in found["seeds"])
+    assert all(row["steps"] >= 0.95 * int(steps) for row in found["seeds"])  # the last choice is not over
+    policy = load_policy(tmp_path / "run" / "policy.safetensors")
+    again = play_many(policy, jax.random.key(0), found["greedy_episodes"])
+    assert again.total_reward.mean(axis=1).tolist() == [row["greedy_return"] for row in found["seeds"]]
+    code, out, _ = run(capsys, "watch", run_folder, "--html", str(tmp_path / "a.html"), "--delay", "0")
+    assert code == 0
+    assert "NaN" not in (tmp_path / "a.html").read_text()
+
+
 REFUSED = [
     (["nonsense"], "no command named 'nonsense'"),
     (["plan"], "needs the name of an environment"),
@@ -243,6 +269,9 @@ REFUSED = [
     (["train", "intra-option", "magnet-arm", "--call-cost", "0.5"], "call_cost is 0.5"),
     (["plan", "four-rooms", "--goal", "104"], "goal is 104"),
     (["train", "dqn", "magnet-arm", "--options", "missing.safetensors"], "missing.safetensors"),
+    (["train", "maxq", "magnet-arm", "--out", "run"], "no ready-made task graph for magnet-arm"),
+    (["train", "hamq", "chain", "--out", "run"], "no ready-made machines for chain"),
+    (["train", "hamq", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),
     (["train", "dqn", "magnet-arm", "--seeds", "0"], "seeds is 0"),
     (["train", "dqn", "magnet-arm", "--no-primitives"], "at least one option"),

@@ -119,7 +119,7 @@ class Arrays(NamedTuple):
     begins: Int[Array, " I"]
     """The joint states where episodes begin."""
     begin_edges: Float[Array, " I"]
-    """Their probabilities, summed up."""
+    """Their probabilities, summed up; empty if they are all equal."""
 
 
 def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rules: Rules, ticks: int) -> Algorithm:
@@ -322,15 +322,17 @@ def fresh(joint: Int[Array, ""]) -> Runner:
 
 def begin(arrays: Arrays, uniform: Float[Array, ""]) -> Int[Array, ""]:
     """Where an episode begins, picked by a uniform number in [0, 1)."""
-    if len(arrays.begins) == 1:
-        return arrays.begins[0]
+    count = len(arrays.begins)
+    if not len(arrays.begin_edges):
+        return arrays.begins[jnp.minimum((uniform * count).astype(jnp.int32), count - 1)]
     return arrays.begins[jnp.searchsorted(arrays.begin_edges, uniform, side="right", method="scan_unrolled")]
 
 
 def on_device(process: JointProcess) -> Arrays:
     """The arrays that ticks look up. There is an action even if the machines never act."""
     begins = np.flatnonzero(process.initial_probs)
-    edges = np.cumsum(process.initial_probs[begins])
+    probs = process.initial_probs[begins]
+    edges = np.cumsum(probs) if np.ptp(probs) > 1e-9 else np.zeros(0)
     acts = max(len(process.actions), 1)
     shape = (acts, process.successors.shape[1])
     return Arrays(
@@ -339,7 +341,7 @@ def on_device(process: JointProcess) -> Arrays:
         probs=jnp.asarray(np.resize(process.probs, shape)),
         rewards=jnp.asarray(np.resize(process.rewards, shape)),
         begins=jnp.asarray(begins, dtype=jnp.int32),
-        begin_edges=jnp.asarray(edges / edges[-1], dtype=jnp.float32),
+        begin_edges=jnp.asarray(edges / probs.sum(), dtype=jnp.float32),
     )
 
 

@@ -5,14 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from lodestone.agents.saved import Policy
+from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
+from lodestone.agents.saved import MachinePolicy, Policy
+from lodestone.envs.base import Environment
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
 
 MAX_STEPS = 5000
 """Primitive steps after which an episode is given up where the policy's rules have no limit that ends it sooner."""
+
+EPISODES = 100
+"""Episodes by which a policy is judged where there is chance."""
 
 
 @dataclass(frozen=True)
@@ -38,20 +44,54 @@ class Playback:
     """Return so far, after each step."""
 
 
-def play(policy: Policy, key: PRNGKeyArray) -> Episode:
+def play(policy: Policy | MachinePolicy, key: PRNGKeyArray) -> Episode:
     """One greedy episode of every seed, all with the same key; leaves have a leading seed axis."""
+    return jax.tree.map(lambda leaf: leaf[:, 0], play_many(policy, key, 1))
+
+
+def play_many(policy: Policy | MachinePolicy, key: PRNGKeyArray, episodes: int) -> Episode:
+    """So many greedy episodes of every seed, all seeds with the same keys; leaves have axes for seed and episode."""
+    keys = key[None] if episodes == 1 else jax.random.split(key, episodes)
+    if isinstance(policy, MachinePolicy):
+        seeds = len(policy.seeds)
+        played = [_of_machines(policy, position, each) for position in range(seeds) for each in keys]
+        return jax.tree.map(lambda *leaves: np.array(leaves).reshape(seeds, episodes), *played)
 
     @jax.jit
-    @jax.vmap
     def run(learned: PyTree) -> Episode:
-        values = policy.values_of(learned)
-        return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
+        def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
+            values = policy.values_of(learned)
+            return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
+
+        return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(learned, keys)
 
     return jax.tree.map(np.asarray, run(policy.learned))
 
 
-def record(policy: Policy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
-    """One greedy episode of the seed at this position, with its pictures."""
+def episodes_to_judge(environment: Environment) -> int:
+    """How many episodes tell what a policy is worth: one in a world without chance that begins in one state."""
+    alone = environment.num_outcomes == 1 and environment.initial_distribution()[0].shape[0] == 1
+    return 1 if alone else EPISODES
+
+
+def _of_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> Episode:
+    episode = _play_machines(policy, position, key)
+    acts = episode.edge < 0
+    ended = episode.joint[-1] == policy.process.end
+    return Episode(*map(jnp.asarray, (episode.reward.sum(), acts.sum(), (~acts).sum(), ended)))
+
+
+def _play_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> JointEpisode:
+    limit = min(policy.rules.step_limit or MAX_STEPS, MAX_STEPS)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    return play_choices(policy.process, greedy_edges(policy.tables[position]), rng, limit)
+
+
+def record(policy: Policy | MachinePolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
+    """One greedy episode of the seed at this position, with its pictures. Of machines the options are the edges of
+    their choices: an edge runs until the next choice."""
+    if isinstance(policy, MachinePolicy):
+        return _record_machines(policy, position, key, agent)
     values = policy.values(position)
     length = int(play(policy, key).steps[position])
 
@@ -74,4 +114,42 @@ def record(policy: Policy, position: int, key: PRNGKeyArray, agent: str) -> Play
         values=trace.values,
         available=trace.available,
         total_reward=np.cumsum(trace.reward),
+    )
+
+
+def _record_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
+    process, table = policy.process, policy.tables[position]
+    episode = _play_machines(policy, position, key)
+    names = process.names
+    states, option, chosen, action, values, available = [process.state[episode.joint[0]]], [], [], [], [], []
+    at, fresh, row, may = 0, False, np.full(len(names), np.nan, np.float32), np.zeros(len(names), dtype=bool)
+    for joint, edge, after in zip(episode.joint, episode.edge, episode.next_state, strict=False):
+        if edge >= 0:
+            allowed = process.available[joint]
+            row, may = np.full(len(names), np.nan, np.float32), np.zeros(len(names), dtype=bool)
+            row[process.name[joint][allowed]], may[process.name[joint][allowed]] = table[joint][allowed], True
+            at, fresh = int(process.name[joint, edge]), True
+            continue
+        states.append(after)
+        option.append(at)
+        chosen.append(fresh)
+        action.append(process.actions[joint - process.num_choices])
+        values.append(row)
+        available.append(may)
+        fresh = False
+    take = process.tables.space.states
+    return Playback(
+        agent=agent,
+        seed=policy.seeds[position],
+        option_names=names,
+        action_names=policy.environment.action_names,
+        pictures=np.stack(
+            [policy.environment.render(jax.tree.map(lambda leaf, state=state: leaf[state], take)) for state in states]
+        ),
+        option=np.array(option),
+        chosen=np.array(chosen),
+        action=np.array(action),
+        values=np.stack(values),
+        available=np.stack(available),
+        total_reward=np.cumsum(episode.reward[episode.edge < 0]),
     )

@@ -22,12 +22,14 @@ from lodestone.envs.state_space import reachable_states
 from lodestone.errors import BadFile, InvalidConfig, LodestoneError
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
+from lodestone.machines.catalogue import machines
 from lodestone.options.base import Capped, Options, Primitives, Union
 from lodestone.options.catalogue import scripted_options, task_named
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.options.scripted import Scripted
 from lodestone.options.tabular import TabularOptions
+from lodestone.planning.joint import JointProcess, joint_process
 from lodestone.types import State
 
 Arrays = dict[str, np.ndarray]
@@ -62,8 +64,29 @@ class Policy:
         return lambda state: learned[space.index_of(state)] / self.reward_scale
 
 
-def save_policy(path: Path, policy: Policy) -> None:
+@dataclass(frozen=True)
+class MachinePolicy:
+    """A trained policy over the choices of an environment's ready-made machines, of one or more seeds."""
+
+    agent: str
+    """Name of the algorithm."""
+    environment: Environment
+    rules: Rules
+    tables: Float[np.ndarray, "seeds N U"]
+    """Q of every edge of every choice of `process`; -inf where it may not be taken."""
+    seeds: tuple[int, ...]
+
+    @property
+    def process(self) -> JointProcess:
+        """The machines in the environment."""
+        return joint_process(self.environment, machines(self.environment))
+
+
+def save_policy(path: Path, policy: Policy | MachinePolicy) -> None:
     """Write one file. Raises `CannotWrite`."""
+    if isinstance(policy, MachinePolicy):
+        _save_machine_policy(path, policy)
+        return
     recipe, arrays = _describe_options(policy.options, "options")
     network = _describe_network(policy.learned) if isinstance(policy.learned, QNetwork) else None
     header = {
@@ -80,12 +103,27 @@ def save_policy(path: Path, policy: Policy) -> None:
     write_arrays(path, arrays | _named_arrays(policy.learned, "learned"), header)
 
 
-def load_policy(path: Path) -> Policy:
+def _save_machine_policy(path: Path, policy: MachinePolicy) -> None:
+    header = {
+        "kind": "policy",
+        "version": __version__,
+        "agent": policy.agent,
+        "environment": describe_environment(policy.environment),
+        "machines": policy.process.configurations.hierarchy.root,
+        "rules": asdict(policy.rules),
+        "seeds": list(policy.seeds),
+    }
+    write_arrays(path, {"tables": np.asarray(policy.tables)}, header)
+
+
+def load_policy(path: Path) -> Policy | MachinePolicy:
     """Raises `BadFile`."""
     arrays, header = _read(path, "policy")
 
-    def build() -> Policy:
+    def build() -> Policy | MachinePolicy:
         environment = make_environment(header["environment"]["name"], **header["environment"]["parameters"])
+        if "machines" in header:
+            return _build_machine_policy(environment, header, arrays)
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
@@ -98,6 +136,16 @@ def load_policy(path: Path) -> Policy:
         return Policy(header["agent"], environment, options, rules, learned, float(header["reward_scale"]), seeds)
 
     return _refuse_bad(path, build)
+
+
+def _build_machine_policy(environment: Environment, header: Recipe, arrays: Arrays) -> MachinePolicy:
+    seeds = tuple(int(seed) for seed in header["seeds"])
+    process = joint_process(environment, machines(environment))
+    template = {"tables": jax.ShapeDtypeStruct((len(seeds), *process.edges.shape), jnp.float32)}
+    tables = np.asarray(_fill(template, {"['tables']": arrays["tables"]}, "")["tables"])
+    if not np.array_equal(np.isneginf(tables), np.broadcast_to(~process.available, tables.shape)):
+        raise BadFile("its values are of other machines.")
+    return MachinePolicy(str(header["agent"]), environment, Rules(**header["rules"]), tables, seeds)
 
 
 def save_options(path: Path, options: Options, environment: Environment) -> None:

@@ -12,27 +12,32 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lodestone.agents.dqn import DQNConfig, dqn
+from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import Learned, MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.saved import Policy
+from lodestone.agents.saved import MachinePolicy, Policy
 from lodestone.envs.base import Environment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.history import History
 from lodestone.learning.loop import Algorithm, train
+from lodestone.machines.catalogue import machines
+from lodestone.machines.configurations import configurations
 from lodestone.options.base import Options
 from lodestone.options.execution import Rules
+from lodestone.planning.joint import joint_process
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.task_graph import tabulate_tasks
 
-AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig
+AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
 
 AGENTS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
     "q-learning": QLearningConfig,
     "intra-option": IntraOptionConfig,
     "maxq": MAXQConfig,
+    "hamq": HAMQConfig,
 }
 """Every agent's settings, by the agent's name."""
 
@@ -48,12 +53,13 @@ def train_policy(
     length: int,
     seeds: Sequence[int],
     on_chunk: Callable[[History, float], bool] = lambda history, fraction: False,
-) -> tuple[Policy, History]:
+) -> tuple[Policy | MachinePolicy, History]:
     """Train all seeds at once for `length` decisions each (tabular agents: primitive steps).
 
-    MAXQ learns in the environment's ready-made task graph; its options must be the primitive actions, and its policy is
-    the one that asks anew from the root down at every step. `on_chunk` gets what happened so far and the fraction of
-    the run that is over, and may end the run by returning True.
+    MAXQ and HAMQ learn in the environment's ready-made task graph or machines: their options must be the primitive
+    actions. What MAXQ leaves is the policy that asks anew from the root down at every step.
+    `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
+    True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
     """
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
@@ -66,7 +72,14 @@ def train_policy(
         if on_chunk(history, min(fraction, 1.0)) or (plan.ends_by_steps and steps >= length):
             break
     learned = plan.learned(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(seeds)], plan.of_carry(carry)))
+    if isinstance(config, HAMQConfig):
+        return MachinePolicy(name, environment, rules, learned, tuple(seeds)), history
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
+
+
+def check_training(config: AgentConfig, environment: Environment, options: Options, rules: Rules) -> None:
+    """Raise what `train_policy` would raise before it begins to train."""
+    _plan(config, environment, options, rules, length=1)
 
 
 class _Plan(NamedTuple):
@@ -98,9 +111,20 @@ def _plan(config: AgentConfig, environment: Environment, options: Options, rules
             return _tables(q_learning(config, environment, options, rules, length), options, length)
         case IntraOptionConfig():
             return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)
+        case HAMQConfig():
+            _refuse_options("HAMQ", options, environment)
+            hierarchy = machines(environment)
+            return _Plan(
+                algorithm=hamq(config, environment, hierarchy, rules, length),
+                # Every tick takes a step, or is a choice that leads straight to another one.
+                rounds=-(-length * configurations(hierarchy).choices_in_a_row // TICKS_PER_ROUND),
+                of_carry=lambda carry: carry.table,
+                choices=joint_process(environment, hierarchy).names,
+                learned=np.asarray,
+                ends_by_steps=True,
+            )
         case MAXQConfig():
-            if options.names != environment.action_names:
-                raise InvalidConfig("MAXQ chooses among the subtasks of its task graph: it takes no options.")
+            _refuse_options("MAXQ", options, environment)
             graph = task_graph(environment)
             tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
 
@@ -116,6 +140,11 @@ def _plan(config: AgentConfig, environment: Environment, options: Options, rules
                 learned=polled,
                 ends_by_steps=True,
             )
+
+
+def _refuse_options(agent: str, options: Options, environment: Environment) -> None:
+    if options.names != environment.action_names:
+        raise InvalidConfig(f"{agent} chooses as its hierarchy says: it takes no options.")
 
 
 def _tables(algorithm: Algorithm, options: Options, steps: int) -> _Plan:

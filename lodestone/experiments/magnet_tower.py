@@ -274,6 +274,7 @@ def _train(
     policy, history = train_policy(
         training.config, chosen.environment, options, training.rules, training.decisions, seeds, tell
     )
+    assert isinstance(policy, Policy)  # DQN's
     agent = AgentRun(
         name=name,
         option_names=options.names,

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from lodestone.experiments.comparison import Gate
 from lodestone.learning.progress import Progress
+from lodestone.planning.joint import JointProcess
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,16 @@ class NumberTable:
 
 
 @dataclass(frozen=True)
+class LearnedMachines:
+    """Machines with what a learned policy does in them."""
+
+    title: str
+    process: JointProcess
+    visits: Float[np.ndarray, "N U"]
+    """How often an episode takes each edge of each choice, expected."""
+
+
+@dataclass(frozen=True)
 class Study:
     """What one experiment has found."""
 
@@ -62,8 +73,7 @@ class Study:
     panels: tuple[Panel, ...]
     tables: tuple[NumberTable, ...]
     gates: tuple[Gate, ...]
-    drawings: tuple[tuple[str, str], ...] = ()
-    """(title, SVG) of further pictures, such as machines."""
+    machines: tuple[LearnedMachines, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from lodestone.experiments.study import NumberTable, Panel, Series, Study
+from lodestone.experiments.study import LearnedMachines, NumberTable, Panel, Series, Study
 from lodestone.files import json_safe, write_atomically, write_json
 from lodestone.report.curves import POINTS, STYLE, Curve, draw_curve, panel_svg, save_figure, thousands
+from lodestone.report.machine_picture import edge_counts, hierarchy_svg
 from lodestone.report.page import (
     AGENT_COLOURS,
     DRAWING_COLOURS,
@@ -277,8 +278,8 @@ def draw_study(study: Study, path: str | Path) -> None:
 
 
 def write_study_report(study: Study, settings: Mapping[str, object], path: str | Path) -> None:
-    """Write the page of a study. Of `settings`, "command", "seconds" and "machine" are shown at the top; its drawings
-    become part of the page as they are, but for colours that follow the page.
+    """Write the page of a study. Of `settings`, "command", "seconds" and "machine" are shown at the top; machines are
+    drawn with what was learned in them.
 
     Raises `CannotWrite`.
     """
@@ -290,8 +291,9 @@ def write_study_report(study: Study, settings: Mapping[str, object], path: str |
         parts += ["<h2>Curves</h2>", _curves(study), _ends(study)]
     if study.tables:
         parts += ["<h2>Numbers</h2>", *(_table(table) for table in study.tables)]
-    if study.drawings:
-        parts += ["<h2>Drawings</h2>", *(_drawing(*each, number) for number, each in enumerate(study.drawings))]
+    if study.machines:
+        parts.append("<h2>Machines</h2>")
+        parts += [_drawing(each.title, svg_of(each), number) for number, each in enumerate(study.machines)]
     parts.append(settings_section(settings))
     write_page(study.title, "\n".join(parts), path)
 
@@ -371,6 +373,12 @@ def _cell(value: str | float, is_number: bool, first: bool) -> str:
     return f'<td class="number">{text}</td>' if is_number else f"<td>{text}</td>"
 
 
+def svg_of(machines: LearnedMachines) -> str:
+    """The machines as an SVG text, with how often an episode takes each edge."""
+    hierarchy = machines.process.configurations.hierarchy
+    return hierarchy_svg(hierarchy, edge_counts(machines.process, machines.visits))
+
+
 def _drawing(title: str, svg: str, number: int) -> str:
     svg = svg[svg.index("<svg") :]  # a page holds no second XML declaration
     figure = chart_figure(svg, f"drawing-{number}", title, PAGE_COLOURS | AGENT_COLOURS | DRAWING_COLOURS)
@@ -413,9 +421,9 @@ def save_study(folder: Path, study: Study, settings: Mapping[str, object]) -> li
     if study.panels:
         files.append(f"{study.name}.png")
         draw_study(study, folder / files[-1])
-    for number, (_, svg) in enumerate(study.drawings, start=1):
+    for number, machines in enumerate(study.machines, start=1):
         files.append(f"{study.name}-{number}.svg")
-        write_atomically(folder / files[-1], svg.encode())
+        write_atomically(folder / files[-1], svg_of(machines).encode())
     write_json(folder / "results.json", study_json(study, settings))
     write_study_report(study, settings, folder / "report.html")
     return [*files, "results.json", "report.html"]

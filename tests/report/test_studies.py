@@ -30,6 +30,7 @@ from lodestone.report.studies import (
     series_curve,
     series_end,
     study_json,
+    svg_of,
     write_study_report,
 )
 
@@ -191,7 +192,7 @@ def test_what_a_page_shows(tmp_path: Path) -> None:
     assert {reference[1:] for reference in references} <= set(ids)
 
 
-def test_charts_and_drawings_follow_the_page(tmp_path: Path) -> None:
+def test_charts_and_machines_follow_the_page(tmp_path: Path) -> None:
     text, _ = page_of(make_study(60), tmp_path / "report.html")
     figures = "".join(re.findall(r"<figure>.*?</figure>", text, flags=re.DOTALL))
     assert not re.findall(r"#(?:[0-9a-f]{6}|[0-9a-f]{3})\b", figures)
@@ -212,9 +213,9 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
         for panel in study.panels
     )
     table = NumberTable(HOSTILE, (HOSTILE,), ((HOSTILE,),))
-    drawings = ((HOSTILE, study.drawings[0][1]),)
+    machines = (replace(study.machines[0], title=HOSTILE),)
     hostile = replace(
-        study, name="a", title=HOSTILE, summary=HOSTILE, panels=panels, tables=(table,), drawings=drawings
+        study, name="a", title=HOSTILE, summary=HOSTILE, panels=panels, tables=(table,), machines=machines
     )
     _, page = page_of(hostile, tmp_path / "report.html")
     assert page.tags.count("script") == 1  # the page's own
@@ -255,17 +256,17 @@ def test_a_study_is_saved(tmp_path: Path) -> None:
     files = save_study(tmp_path / "out", study, SETTINGS)
     assert files == ["fake.png", "fake-1.svg", "results.json", "report.html"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(files)
-    assert (tmp_path / "out" / "fake-1.svg").read_text() == study.drawings[0][1]
+    assert (tmp_path / "out" / "fake-1.svg").read_text() == svg_of(study.machines[0])
     assert json.loads((tmp_path / "out" / "results.json").read_text()) == study_json(study, SETTINGS)
     assert "An invented study" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_a_study_of_numbers_only_is_saved(tmp_path: Path) -> None:
-    study = replace(make_study(5), panels=(), drawings=(), gates=())
+    study = replace(make_study(5), panels=(), machines=(), gates=())
     assert save_study(tmp_path, study, {}) == ["results.json", "report.html"]
     page = Page((tmp_path / "report.html").read_text())
     assert page.open == []
-    assert not {"Gates", "Curves", "Drawings", "Settings"} & set(page.texts)
+    assert not {"Gates", "Curves", "Machines", "Settings"} & set(page.texts)
 
 
 def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
