@@ -139,36 +139,47 @@ def test_nothing_is_learned_across_episodes() -> None:
     assert history.taken(0)[1] == len(episodes.steps)
 
 
-class Still(Corridor):
-    """One state for ever."""
-
-    def transition(self, state, action, outcome):
-        return state
+class Endless(Corridor):
+    """The last cell ends nothing: there every step to the right pays."""
 
     def terminal(self, state):
         return jnp.bool_(False)
 
 
+THREE_STEPS = Hierarchy(
+    "root",
+    (
+        Machine("root", "which", {"which": Choice({"walk": "walk"}), "walk": Call("walk", then="which")}),
+        sequence("walk", "right", "right", "right"),
+    ),
+)
+
+
 def test_a_limit_between_two_choices_is_not_learned_from_and_one_at_a_choice_bootstraps() -> None:
-    """Reward 1 for ever: V = 1 / (1 - 0.9) = 10, whether the limit cuts the walk of three steps or comes with its end.
-    Where the limit is taken for an end, it is not."""
-    still = Still(length=2, step_reward=1.0)
-    root = Machine("root", "which", {"which": Choice({"walk": "walk"}), "walk": Call("walk", then="which")})
-    hierarchy = Hierarchy("root", (root, sequence("walk", "left", "left", "left")))
-    for limit in (3, 10):
-        table, history = learn(HAMQConfig(), still, hierarchy, Rules(discount=0.9, step_limit=limit), 6400)
-        assert table[0, 0, 0] == pytest.approx(10.0, abs=1e-3)
+    """In the last of three cells each step pays 2, so that it is worth 2 / (1 - 0.9) = 20, and the first cell less,
+    whether the limit cuts the walk of three steps or comes with its end. Where the limit is taken for an end, it is
+    not."""
+    process = joint_process(Endless(length=3), THREE_STEPS)
+    exact = joint_values(process, 0.9).choice_values
+    assert sorted(exact[:, 0]) == pytest.approx([1 + 0.9 * 2 + 0.81 * 2 + 0.729 * 20, 20.0])
+    for limit in (6, 10):
+        table, history = learn(
+            HAMQConfig(), Endless(length=3), THREE_STEPS, Rules(discount=0.9, step_limit=limit), 9600
+        )
+        np.testing.assert_allclose(table[0], exact, atol=1e-3)
         assert set(history.episodes(0).length_steps) == {limit}
         assert not history.episodes(0).success.any()
-    rules = Rules(discount=0.9, step_limit=3, bootstrap_at_limit=False)
-    table, _ = learn(HAMQConfig(), still, hierarchy, rules, 6400)
-    assert table[0, 0, 0] == pytest.approx(1 + 0.9 + 0.81, abs=1e-5)
+    rules = Rules(discount=0.9, step_limit=6, bootstrap_at_limit=False)
+    table, _ = learn(HAMQConfig(), Endless(length=3), THREE_STEPS, rules, 9600)
+    last = 2 * (1 + 0.9 + 0.81)
+    assert sorted(table[0, :, 0]) == pytest.approx([last, 1 + 0.9 * 2 + 0.81 * 2 + 0.729 * last], abs=1e-4)
 
 
 def test_a_decision_limit_counts_choices() -> None:
-    still = Still(length=2, step_reward=1.0)
-    _, history = learn(HAMQConfig(), still, every_action(still), Rules(decision_limit=7), 3200)
-    assert set(history.episodes(0).length_decisions) == {7}
+    _, history = learn(HAMQConfig(), Endless(length=3), THREE_STEPS, Rules(decision_limit=7), 3200)
+    episodes = history.episodes(0)
+    assert set(episodes.length_decisions) == {7}
+    assert set(episodes.length_steps) == {21}
 
 
 def test_every_step_and_every_choice_is_told() -> None:
@@ -276,3 +287,27 @@ def test_machines_learn_faster_and_reach_their_own_optimum() -> None:
     assert flat.shape == (5, EPISODES)
     assert flat[:, 100:150].mean() < -200
     assert flat[:, -100:].mean() == pytest.approx(82.0, abs=0.1)
+
+
+class Unequal(Corridor):
+    """Episodes begin one step from the end four times out of five, and else two steps from it."""
+
+    def initial_distribution(self):
+        return jnp.array([0.2, 0.8]), jnp.array([0, 1], dtype=jnp.int32)
+
+
+def test_episodes_begin_as_often_as_the_environment_says() -> None:
+    corridor = Unequal(length=3)
+    walk = {"which": Choice({"on": "on"}), "on": Action("right", then="which")}
+    _, history = learn(HAMQConfig(), corridor, Hierarchy("walk", (Machine("walk", "which", walk),)), Rules(), 32_000)
+    lengths = history.episodes(0).length_steps
+    assert set(lengths) == {1, 2}
+    assert (lengths == 1).mean() == pytest.approx(0.8, abs=0.02)
+
+
+def test_machines_that_never_act_end_in_no_time() -> None:
+    vertices = {"which": Choice({"stop": "stop"}), "stop": Stop()}
+    table, history = learn(HAMQConfig(), Corridor(), Hierarchy("m", (Machine("m", "which", vertices),)), Rules(), 320)
+    assert table.tolist() == [[[0.0]]]
+    assert history.episodes(0).length_decisions.tolist() == [1] * 320
+    assert not history.episodes(0).length_steps.any()
