@@ -1,6 +1,7 @@
 """The names that most programs on top of Lodestone need, in one place."""
 
 from lodestone.agents.dqn import DQNConfig
+from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.playing import Playback, play, record
 from lodestone.agents.pretraining import as_options, pretrain
@@ -19,6 +20,7 @@ from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
 from lodestone.learning.networks import NetworkConfig
+from lodestone.machines.machine import Hierarchy, Machine, every_action
 from lodestone.options.base import Capped, Options, Primitives, Union
 from lodestone.options.catalogue import named_options, scripted_options
 from lodestone.options.execution import Rules
@@ -26,6 +28,7 @@ from lodestone.options.four_rooms import hallway_options
 from lodestone.options.scripted import Script, Scripted
 from lodestone.options.subgoals import Subgoal, subgoal_options
 from lodestone.planning.interruption import Interrupting
+from lodestone.planning.joint import hierarchical_optimum
 from lodestone.planning.solve import optimum
 
 __all__ = [
@@ -35,9 +38,12 @@ __all__ = [
     "DQNConfig",
     "Environment",
     "FourRooms",
+    "HAMQConfig",
+    "Hierarchy",
     "Interrupting",
     "IntraOptionConfig",
     "LodestoneError",
+    "Machine",
     "MagnetArm",
     "NetworkConfig",
     "Options",
@@ -55,8 +61,10 @@ __all__ = [
     "TwoRooms",
     "Union",
     "as_options",
+    "every_action",
     "go_down_task",
     "hallway_options",
+    "hierarchical_optimum",
     "lift_task",
     "load_options",
     "load_policy",
