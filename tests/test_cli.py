@@ -52,6 +52,21 @@ def test_plan_takes_an_environments_parameters(capsys):
     assert found["optimal_steps"] == pytest.approx(8.3924, abs=1e-4)
 
 
+def test_plan_knows_machines_and_subtasks(capsys):
+    code, out, _ = run(capsys, "plan", "taxi", "--move-success", "0.8", "--machines", "--subtasks", "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert found["optimal_return"] == pytest.approx(3.954575, abs=1e-6)
+    assert found["machines"]["optimal_return"] == pytest.approx(3.954575, abs=1e-6)
+    assert found["subtasks"]["recursive_return"] == pytest.approx(3.954575, abs=1e-6)
+    assert found["subtasks"]["values_stored"] <= 632
+    code, out, _ = run(
+        capsys, "plan", "magnet-arm", "--rows", "5", "--bricks", "4", "--tower-height", "4", "--machines"
+    )
+    assert "24, 8" in out
+    assert run(capsys, "plan", "four-rooms", "--machines")[0] == 2
+
+
 def test_plan_prints_a_table(capsys):
     code, out, _ = run(capsys, "plan", "magnet-arm", *TINY)
     assert code == 0

@@ -59,7 +59,6 @@ def run(seeds: int, progress: Progress) -> Study:
     arm_best, arm_machine = optimum(ARM), hierarchical_optimum(ARM, machines(ARM))
     maze_best, maze_machine = optimum(MAZE), hierarchical_optimum(MAZE, machines(MAZE))
     maze_values = _best_in_maze()
-    maze_x = np.geomspace(3000, max(MAZE_STEPS.values()), 120)
     return Study(
         name=EXPERIMENT.name,
         title=EXPERIMENT.title,
@@ -85,13 +84,12 @@ def run(seeds: int, progress: Progress) -> Study:
             Panel(
                 f"Maze of corridors, {maze_best.states:,} states",
                 "primitive steps",
-                "discounted value, choices random with 0.1",
-                tuple(Series(name, maze_x, one.at(one.steps, maze_x)) for name, one in maze.items()),
+                "discounted value from the start",
+                tuple(_maze_series(name, one) for name, one in maze.items()),
                 references=(
                     (f"optimal policy {maze_values[0]:.0f}", maze_values[0]),
                     (f"of the machine {maze_values[1]:.0f}", maze_values[1]),
                 ),
-                log_x=True,
             ),
         ),
         tables=(
@@ -164,6 +162,11 @@ def _in_maze(name: str, seeds: int, progress: Progress) -> Followed:
         choices, judge = options.names, partial(_judge_flat, seeds)
     tell = lambda done, text: progress.advance(done * steps, text)  # noqa: E731
     return follow(algorithm, choices, seeds, rounds, LOOKS, judge, steps, tell)
+
+
+def _maze_series(name: str, one: Followed) -> Series:
+    x = np.linspace(0, MAZE_STEPS[name], 120)
+    return Series(name, x, one.at(one.steps, x))
 
 
 def _learned(title: str, environment: Environment, one: Followed) -> LearnedMachines:
