@@ -3,10 +3,11 @@
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.intra_option import IntraOptionConfig
+from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.playing import Playback, play, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.q_learning import QLearningConfig
-from lodestone.agents.saved import Policy, load_options, load_policy, save_options, save_policy
+from lodestone.agents.saved import MachinePolicy, Policy, load_options, load_policy, save_options, save_policy
 from lodestone.agents.training import train_policy
 from lodestone.devices import use_all_cores
 from lodestone.envs.base import Environment
@@ -30,10 +31,12 @@ from lodestone.options.subgoals import Subgoal, subgoal_options
 from lodestone.planning.interruption import Interrupting
 from lodestone.planning.joint import hierarchical_optimum
 from lodestone.planning.solve import optimum
+from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph
 
 __all__ = [
     "Capped",
     "Chain",
+    "Child",
     "CorridorMaze",
     "DQNConfig",
     "Environment",
@@ -43,7 +46,9 @@ __all__ = [
     "Interrupting",
     "IntraOptionConfig",
     "LodestoneError",
+    "MAXQConfig",
     "Machine",
+    "MachinePolicy",
     "MagnetArm",
     "NetworkConfig",
     "Options",
@@ -56,7 +61,9 @@ __all__ = [
     "Script",
     "Scripted",
     "Subgoal",
+    "Subtask",
     "Task",
+    "TaskGraph",
     "Taxi",
     "TwoRooms",
     "Union",

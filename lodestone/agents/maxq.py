@@ -11,7 +11,8 @@ where V(i, s') = V(b, s') + C(i, s', b) for the b with the largest Q~, and 0 if 
 R~ is what a subtask acts by; C without it is what its caller sees. *All-states updating* does the same for every state
 that the child went through. MAXQ-0 is the case without pseudo-rewards and without all-states updating.
 
-The recursion is unrolled into small events, one at a time in every seed: call a child, act, update one state, return.
+The recursion is unrolled into events, one at a time in every seed: a few states are updated, and, when none is left to
+update, a child is called, which may be a primitive action, or a subtask that has ended is left.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ from lodestone.planning.tables import tabulate
 from lodestone.subtasks.recursive import polled_policy
 from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
 
-EVENTS_PER_ROUND = 64
+EVENTS_PER_ROUND = 32
 """Events between two looks at the schedules."""
+UPDATES_PER_EVENT = 4
+"""States that one event updates at most: an update costs far less than what else an event does."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ class Learned(NamedTuple):
     values: Float[Array, " slots"]
     """V of primitive actions and C of calls; all start at 0."""
     inner: Float[Array, " slots"]
-    """C~ of calls; empty if no subtask has a pseudo-reward, as it would be the same."""
+    """C~ of the calls of subtasks that have a pseudo-reward; elsewhere it would be the same as C. Empty if there is no
+    such subtask."""
 
 
 class Hierarchy(NamedTuple):
@@ -116,12 +120,15 @@ class Values(NamedTuple):
     """The edge with the largest Q~, the first of equals."""
 
 
+FORBIDDEN = -2
+
+
 class Arrays(NamedTuple):
     """`TaskTables` on the device, the state first."""
 
     completion_slot: Int[Array, "S E"]
+    """-1 where the completion is 0, `FORBIDDEN` where the call is not allowed."""
     reward_slot: Int[Array, "S A"]
-    available: Bool[Array, "S E"]
     ends: Bool[Array, "S T"]
     pseudo_rewards: Float[Array, "S T"]
 
@@ -129,9 +136,8 @@ class Arrays(NamedTuple):
 def on_device(tasks: TaskTables) -> Arrays:
     """The arrays that `values_at` looks up."""
     return Arrays(
-        completion_slot=jnp.asarray(tasks.completion_slot.T),
+        completion_slot=jnp.asarray(np.where(tasks.available, tasks.completion_slot, FORBIDDEN).T),
         reward_slot=jnp.asarray(tasks.reward_slot.T),
-        available=jnp.asarray(tasks.available.T),
         ends=jnp.asarray(tasks.ends.T),
         pseudo_rewards=jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32),
     )
@@ -139,10 +145,9 @@ def on_device(tasks: TaskTables) -> Arrays:
 
 def values_at(tasks: TaskTables, arrays: Arrays, learned: Learned, state: Int[Array, ""]) -> Values:
     """All values of one state, from the primitive actions up."""
-    slot = arrays.completion_slot[state]
+    slot, ends = arrays.completion_slot[state], arrays.ends[state]
     completions = jnp.where(slot >= 0, learned.values[slot], 0.0)
-    inner_completions = jnp.where(slot >= 0, learned.inner[slot], 0.0)
-    available, ends, pseudo_rewards = arrays.available[state], arrays.ends[state], arrays.pseudo_rewards[state]
+    acts_otherwise = [bool(rewards.any()) for rewards in tasks.pseudo_rewards]
 
     # One number at a time rather than arrays of a subtask's children: the compiler makes one loop over seeds of it all.
     nodes = dict(enumerate(learned.values[arrays.reward_slot[state]]))
@@ -151,15 +156,18 @@ def values_at(tasks: TaskTables, arrays: Arrays, learned: Learned, state: Int[Ar
     for subtask in tasks.bottom_up:
         best_inner, best_value, choice = jnp.float32(-jnp.inf), jnp.float32(0), jnp.int32(0)
         for number in tasks.edges_of(subtask):
-            below = nodes[tasks.edges[number].child]
-            inner = jnp.where(available[number], below + inner_completions[number], -jnp.inf)
+            below, inner_completion = nodes[tasks.edges[number].child], completions[number]
+            if acts_otherwise[subtask]:
+                inner_completion = jnp.where(slot[number] >= 0, learned.inner[slot[number]], 0.0)
+            inner = jnp.where(slot[number] != FORBIDDEN, below + inner_completion, -jnp.inf)
             better = inner > best_inner
             best_inner = jnp.where(better, inner, best_inner)
             best_value = jnp.where(better, below + completions[number], best_value)
             choice = jnp.where(better, number, choice)
             inner_edges[number] = inner
         nodes[tasks.num_actions + subtask] = jnp.where(ends[subtask], 0.0, best_value)
-        inner_subtasks[subtask] = jnp.where(ends[subtask], pseudo_rewards[subtask], best_inner)
+        after_end = arrays.pseudo_rewards[state, subtask] if acts_otherwise[subtask] else jnp.float32(0)
+        inner_subtasks[subtask] = jnp.where(ends[subtask], after_end, best_inner)
         choices[subtask] = choice
 
     def ordered(found: dict[int, Array]) -> Array:
@@ -190,6 +198,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     caller = jnp.asarray([edge.subtask for edge in tasks.edges], dtype=jnp.int32)
     edges_of = _padded([tasks.edges_of(subtask) for subtask in range(len(tasks.ends))])
     child_of = jnp.asarray([edge.child for edge in tasks.edges], dtype=jnp.int32)
+    powers = jnp.asarray(rules.discount ** np.arange(limit + 1), dtype=jnp.float32)
 
     def init(key: PRNGKeyArray) -> Carry:
         start_key, key = jax.random.split(key)
@@ -211,52 +220,51 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     def event(
         carry: Carry, noise: Float[Array, "4"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
     ) -> tuple[Carry, RoundLog]:
-        """Update one state if a call has ended and not all of its states are updated; else return from a subtask that
-        has ended; else call a child, which, if it is a primitive action, acts."""
+        """Update some states if a call has ended; if all are done, return from a subtask that has ended; else call a
+        child, which, if it is a primitive action, acts."""
         hierarchy, state, steps = carry.hierarchy, carry.state, carry.steps
-        learned = carry.learned if with_pseudo_rewards else Learned(carry.learned.values, carry.learned.values)
-        known, ends = values_at(tasks, arrays, learned, state), arrays.ends[state]
+        known, ends = values_at(tasks, arrays, carry.learned, state), arrays.ends[state]
+
+        edge, first = hierarchy.edge[carry.level], hierarchy.called_at[carry.level]
+        value, inner_value = known.nodes[num_actions + caller[edge]], known.inner_subtasks[caller[edge]]
+        position, (values, inner), loss = carry.position, carry.learned, jnp.float32(0)
+        for _ in range(UPDATES_PER_EVENT if config.all_states else 1):
+            due = position >= first
+            slot = jnp.where(due, arrays.completion_slot[carry.visited[position], edge], -1)
+            weight = powers[steps - position]
+            values, error = _move(values, slot, weight * value, learning_rate)
+            if with_pseudo_rewards:
+                inner, _ = _move(inner, slot, weight * inner_value, learning_rate)
+            loss += jnp.square(error)
+            position -= due.astype(jnp.int32)
 
         up, subtask = hierarchy.depth, hierarchy.subtask[hierarchy.depth]
-        updating = carry.position >= hierarchy.called_at[carry.level]
+        updating = position >= first
         ended = ends[hierarchy.subtask] & (jnp.arange(levels) <= up)
         returning = ~updating & (jnp.any(ended) | carry.cut)
         calling = ~updating & ~returning
         episode_over = returning & (up == 0)
 
         edges = edges_of[subtask]
-        allowed = (edges >= 0) & arrays.available[state, edges]
-        choice = edges[epsilon_greedy(noise[:2], known.inner_edges[edges], allowed, epsilon)]
+        row = jnp.where(edges >= 0, known.inner_edges[edges], -jnp.inf)
+        choice = edges[epsilon_greedy(noise[:2], row, row > -jnp.inf, epsilon)]
         child = child_of[choice]
         acting = calling & (child < num_actions)
         descending = calling & ~acting
         action = jnp.minimum(child, num_actions - 1)
         step = next_step(world, noise[2], state, action)
         cut = acting & (steps + 1 >= limit) & ~step.terminated
-
-        # What is learned: from the call of a level, or, on acting, from the reward of the action.
-        edge = hierarchy.edge[carry.level]
-        subject = caller[edge]
-        slot = jnp.where(updating, arrays.completion_slot[carry.visited[carry.position], edge], -1)
-        slot = jnp.where(acting, arrays.reward_slot[state, action], slot)
-        weight = jnp.float32(rules.discount) ** (steps - carry.position).astype(jnp.float32)
-        target = jnp.where(acting, step.reward, weight * known.nodes[num_actions + subject])
-        error = jnp.where(slot >= 0, target - learned.values[slot], 0.0)
-        values = learned.values.at[slot].add(learning_rate * error)
-        inner = values
-        if with_pseudo_rewards:
-            inner_target = jnp.where(acting, step.reward, weight * known.inner_subtasks[subject])
-            inner_error = jnp.where(slot >= 0, inner_target - learned.inner[slot], 0.0)
-            inner = learned.inner.at[slot].add(learning_rate * inner_error)
+        values, error = _move(
+            values, jnp.where(acting, arrays.reward_slot[state, action], -1), step.reward, learning_rate
+        )
 
         # A call is learned from when it has ended by itself, not when a subtask above it has.
         from_child = returning & ~episode_over & ends[subtask] & ~carry.cut
         level = jnp.where(acting, up, jnp.where(returning, up - 1, carry.level))
         last = jnp.where(acting, steps, steps - 1)
-        first = jnp.where(acting, steps, hierarchy.called_at[jnp.maximum(up - 1, 0)])
-        begins = acting | from_child
-        position = jnp.where(updating, carry.position - 1, -1)
-        position = jnp.where(begins, last if config.all_states else first, position)
+        if not config.all_states:
+            last = jnp.where(acting, steps, hierarchy.called_at[jnp.maximum(up - 1, 0)])
+        position = jnp.where(acting | from_child, last, jnp.where(updating, position, -1))
 
         called = jnp.arange(levels) == jnp.where(calling, up, levels)
         entered = jnp.arange(levels) == jnp.where(descending, up + 1, levels)
@@ -270,7 +278,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         total = jnp.where(acting, carry.episode_return + step.reward, carry.episode_return)
         taken = steps + acting.astype(jnp.int32)
         next_carry = Carry(
-            learned=Learned(values, inner if with_pseudo_rewards else carry.learned.inner),
+            learned=Learned(values, inner),
             hierarchy=after,
             state=jnp.where(episode_over, initial_state(world, noise[3]), moved),
             visited=carry.visited.at[jnp.where(acting, steps, limit)].set(state, mode="drop"),
@@ -291,7 +299,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
             episode_return=total,
             episode_steps=taken,
             episode_decisions=taken,
-            loss=jnp.square(error),
+            loss=loss + jnp.square(error),
         )
         return next_carry, log
 
@@ -307,6 +315,14 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         return carry._replace(key=key), log._replace(loss=jnp.mean(log.loss))
 
     return Algorithm(init, run_round)
+
+
+def _move(
+    values: Float[Array, " slots"], slot: Int[Array, ""], target: Float[Array, ""], learning_rate: Float[Array, ""]
+) -> tuple[Float[Array, " slots"], Float[Array, ""]]:
+    """The value of a slot moved towards a target, and the error; nothing where the slot is negative."""
+    error = jnp.where(slot >= 0, target - values[slot], 0.0)
+    return values.at[slot].add(learning_rate * error), error
 
 
 def as_configured(config: MAXQConfig, graph: TaskGraph) -> TaskGraph:
@@ -361,8 +377,6 @@ def _everywhere(
     arrays = on_device(tasks)
 
     def everywhere(learned: Learned) -> Values:
-        if not learned.inner.size:
-            learned = Learned(learned.values, learned.values)
         return jax.vmap(partial(values_at, tasks, arrays, learned))(jnp.arange(tables.num_states))
 
     return tasks, everywhere

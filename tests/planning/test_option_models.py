@@ -326,9 +326,10 @@ def test_random_options_beside_the_primitives_change_no_optimal_value(seed: int,
     solution = option_value_iteration(tables, options, 0.9)
     np.testing.assert_allclose(solution.values, optimal.values, atol=2e-9)
     np.testing.assert_allclose(solution.option_values[:, :NUM_ACTIONS], optimal.action_values, atol=2e-9)
-    paid_to_call = option_value_iteration(tables, options, 0.9, call_cost=-5.0)
-    if set(caps) != {1}:
-        assert (paid_to_call.values > optimal.values + 1.0).any()
+    # No option is so bad that a call is not worth so much.
+    paid_to_call = option_value_iteration(tables, options, 0.9, call_cost=-100.0)
+    calls = options.initiation & (np.array(options.max_steps)[:, None] != 1) & ~tables.terminal
+    assert (paid_to_call.values > optimal.values + 1.0).any() == calls.any()
 
 
 @settings(max_examples=40)
