@@ -41,7 +41,7 @@ CONFIGS: dict[str, MAXQConfig | QLearningConfig] = {
 }
 STEPS = {ABSTRACT: 70_000, WHOLE: 250_000, FLAT: 120_000}
 """Primitive steps of each seed."""
-LOOKS = 150
+LOOKS = 800
 
 
 def run(seeds: int, progress: Progress) -> Study:
