@@ -23,6 +23,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from lodestone import __version__
 from lodestone.agents.intra_option import IntraOptionConfig
+from lodestone.agents.maxq import MAXQConfig, as_configured
 from lodestone.agents.playing import episodes_to_judge, play_many, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.run_folder import POLICY, RunFolder
@@ -32,7 +33,7 @@ from lodestone.console import ConsoleProgress
 from lodestone.devices import use_all_cores
 from lodestone.envs.base import Environment
 from lodestone.envs.registry import ENVIRONMENTS, describe_environment, environment_class
-from lodestone.errors import InvalidConfig, LodestoneError, TooManyStates, check_name
+from lodestone.errors import InvalidConfig, InvalidTaskGraph, LodestoneError, TooManyStates, check_name
 from lodestone.experiments import magnet_tower
 from lodestone.experiments.comparison import Gate
 from lodestone.experiments.registry import EXPERIMENTS, experiment
@@ -51,7 +52,7 @@ from lodestone.planning.solve import optimum
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.as_machines import as_machines
 from lodestone.subtasks.catalogue import task_graph
-from lodestone.subtasks.recursive import recursive_optimum
+from lodestone.subtasks.recursive import check_abstraction, recursive_optimum
 from lodestone.subtasks.task_graph import tabulate_tasks
 
 AgentT = TypeVar("AgentT", bound=AgentConfig)
@@ -316,6 +317,16 @@ def _choose_options(train: Train) -> Options:
     return options
 
 
+def _warn_of_unsafe_abstraction(config: MAXQConfig, environment: Environment, discount: float) -> None:
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(as_configured(config, task_graph(environment)), environment, tables)
+    try:
+        check_abstraction(tasks, tables, recursive_optimum(tasks, tables, discount))
+    except InvalidTaskGraph as error:
+        hint = "try --discount 1 or --no-abstraction"
+        print(f"lodestone: note: {error} What is learned is not exact; {hint}.", file=sys.stderr)
+
+
 def _train(train: Train, agent: str) -> None:
     if train.seeds < 1:
         raise InvalidConfig(f"seeds is {train.seeds}, but must be at least 1.")
@@ -324,6 +335,8 @@ def _train(train: Train, agent: str) -> None:
     environment, rules = train.environment, train.rules
     options = _choose_options(train)
     check_training(train.agent, environment, options, rules)
+    if isinstance(train.agent, MAXQConfig):
+        _warn_of_unsafe_abstraction(train.agent, environment, rules.discount)
     seeds = tuple(range(train.seed, train.seed + train.seeds))
     folder = None
     if train.out is not None:

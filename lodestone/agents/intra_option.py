@@ -128,9 +128,10 @@ def intra_option_q_learning(
     numbered = on_numbers(options, tables.space)
     needed = needed_chance(world, numbered)
     one_step = np.array(options.max_steps) == 1
+    chosen_from = tabulate_options(options, tables.space)
     if config.behaviour == "primitives":
-        chosen_from = tabulate_options(options, tables.space)
-        check_available(tables, chosen_from._replace(initiation=chosen_from.initiation & one_step[:, None]))
+        chosen_from = chosen_from._replace(initiation=chosen_from.initiation & one_step[:, None])
+    check_available(tables, chosen_from)
     probs = np.asarray(numbered.policy_table)
     draws = bool(((probs > 0) & (probs < 1)).any())
     weights_of = jnp.asarray(probs.swapaxes(1, 2))  # [S, A, O], so that a step needs one row

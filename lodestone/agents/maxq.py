@@ -180,9 +180,9 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
     `steps`, primitive steps.
 
-    A limit, of steps or of decisions, which are steps here, unwinds the stack without learning from calls that had not
-    ended. Raises `TooManyStates`, `InvalidTaskGraph`, and `InvalidConfig` for rules without a limit or that are about
-    options.
+    A limit, of steps or of decisions, which are steps here, unwinds the stack without learning from the calls on it;
+    only the last action is learned from. Raises `TooManyStates`, `InvalidTaskGraph`, and `InvalidConfig` for rules
+    without a limit or that are about options.
     """
     if rules.call_cost or rules.undiscounted_option_reward or not rules.bootstrap_at_limit:
         raise InvalidConfig("MAXQ has no call cost, no undiscounted option reward, and takes no limit for an end.")
@@ -253,7 +253,8 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         descending = calling & ~acting
         action = jnp.minimum(child, num_actions - 1)
         step = next_step(world, noise[2], state, action)
-        cut = acting & (steps + 1 >= limit) & ~step.terminated
+        terminated = step.terminated | arrays.ends[step.state, 0]  # the root may end before the environment does
+        cut = acting & (steps + 1 >= limit) & ~terminated
         values, error = _move(
             values, jnp.where(acting, arrays.reward_slot[state, action], -1), step.reward, learning_rate
         )
@@ -294,8 +295,8 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
             valid=acting,
             option=choice,
             steps=jnp.int32(1),
-            episode_ended=step.terminated | cut,
-            terminated=step.terminated,
+            episode_ended=terminated | cut,
+            terminated=terminated,
             episode_return=total,
             episode_steps=taken,
             episode_decisions=taken,

@@ -24,6 +24,7 @@ from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Chance, Decision, Rules, deal, start_actor, tick
 from lodestone.options.tabular import TabularOptions, on_numbers
 from lodestone.planning.enumerated import Enumerated, enumerated
+from lodestone.planning.option_models import check_available, tabulate_options
 from lodestone.planning.tables import tabulate
 
 STEPS_PER_ROUND = 32
@@ -86,9 +87,10 @@ def q_learning(
     """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
     `steps`.
 
-    Raises `TooManyStates` where the tables would be too large.
+    Raises `TooManyStates` where the tables would be too large, and `NoOptionAvailable`.
     """
     tables = tabulate(environment)
+    check_available(tables, tabulate_options(options, tables.space))
     world = enumerated(tables, environment.action_names)
     return q_learning_on_numbers(config, world, on_numbers(options, tables.space), rules, steps)
 

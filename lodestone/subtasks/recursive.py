@@ -18,7 +18,14 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from lodestone.errors import InvalidTaskGraph
-from lodestone.planning.solve import CHOICE_TOLERANCE, check_discount, ends_surely, greedy_choices, iterate_values
+from lodestone.planning.solve import (
+    CHOICE_TOLERANCE,
+    check_discount,
+    ends_surely,
+    factorise,
+    greedy_choices,
+    iterate_values,
+)
 from lodestone.planning.tables import Tables, state_text
 from lodestone.subtasks.task_graph import TaskTables
 
@@ -34,6 +41,8 @@ class HierarchyValues(NamedTuple):
     is not discounted and it may never end."""
     completions: Float[np.ndarray, "E S"]
     """C(i, s, a); 0 where the call is not allowed."""
+    inner_completions: Float[np.ndarray, "E S"]
+    """C~(i, s, a): the same with the caller's pseudo-reward."""
     choices: Int[np.ndarray, "T S"]
     """The edge that each subtask takes; -1 where it has ended."""
 
@@ -83,10 +92,13 @@ def polled_policy(tasks: TaskTables, choices: Int[np.ndarray, "T S"]) -> Int[np.
 
 def check_abstraction(tasks: TaskTables, tables: Tables, exact: HierarchyValues) -> None:
     """Raise `InvalidTaskGraph` unless all that is stored as one value is one value, for the choices of `exact`."""
-    for number, (edge, name) in enumerate(zip(tasks.edges, tasks.edge_names, strict=True)):
+    for number, name in enumerate(tasks.edge_names):
         slots = np.where(tasks.available[number], tasks.completion_slot[number], -2)
-        wanted = np.where(slots == -1, 0.0, exact.completions[number])
-        _require_alike(name, "completion", slots, wanted, exact.completions[number], tables)
+        for what, completions in (
+            ("completion", exact.completions[number]),
+            ("completion with the pseudo-reward", exact.inner_completions[number]),
+        ):
+            _require_alike(name, what, slots, np.where(slots == -1, 0.0, completions), completions, tables)
     rewards = tables.mean_rewards()
     for action in range(tasks.num_actions):
         slots = np.where(tasks.reward_slot[action] >= 0, tasks.reward_slot[action], -2)
@@ -135,6 +147,7 @@ def _bottom_up(
     found = HierarchyValues(
         values=np.zeros((len(tasks.ends), size)),
         completions=np.zeros((len(tasks.edges), size)),
+        inner_completions=np.zeros((len(tasks.edges), size)),
         choices=np.full((len(tasks.ends), size), -1),
     )
     for subtask in tasks.bottom_up:
@@ -151,9 +164,14 @@ def _bottom_up(
         models[tasks.num_actions + subtask] = model
         found.values[subtask] = np.where(ends, 0.0, model.rewards)
         found.choices[subtask] = np.where(live, np.asarray(edges)[best], -1)
+        pseudo_rewards = tasks.pseudo_rewards[subtask]
+        inner_values = np.where(ends, pseudo_rewards, model.rewards + model.leads_to @ pseudo_rewards)
         for edge, child in zip(edges, children, strict=True):
-            completion = _expect(child.leads_to, found.values[subtask])
-            found.completions[edge] = np.where(tasks.available[edge], completion, 0.0)
+            for completions, following in (
+                (found.completions, found.values[subtask]),
+                (found.inner_completions, inner_values),
+            ):
+                completions[edge] = np.where(tasks.available[edge], _expect(child.leads_to, following), 0.0)
     return found
 
 
@@ -192,10 +210,11 @@ def _run(
         sure &= ends_surely(sparse.csr_array(going_on), ending.sum(axis=1) > 0)
     # A state that surely ends is followed by such states only, so the others can be left out.
     inside = np.flatnonzero(sure)
-    inverse = np.linalg.inv(np.eye(len(inside)) - going_on[np.ix_(inside, inside)])
+    # What has no chance must come out as exactly 0: else it would be taken for a risk.
+    factors = factorise(sparse.csr_array(going_on[np.ix_(inside, inside)]))
     total, leads_to = np.full(size, -np.inf), np.zeros((size, size))
-    total[inside] = inverse @ rewards[inside]
-    leads_to[inside] = inverse @ ending[inside]
+    total[inside] = factors.solve(rewards[inside])
+    leads_to[inside] = factors.solve(ending[inside])
     return _Model(total, leads_to)
 
 

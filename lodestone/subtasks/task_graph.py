@@ -77,6 +77,11 @@ class TaskGraph:
             for name in called:
                 if called.count(name) > 1:
                     raise InvalidTaskGraph(f"Subtask {subtask.name!r} has two children named {name!r}.")
+            if subtask.pseudo_reward is not None and any(child.final for child in subtask.children):
+                raise InvalidTaskGraph(
+                    f"Subtask {subtask.name!r} has a pseudo-reward, which is learned as a part of completions, and so "
+                    "none of its children can be final."
+                )
         calls = self.calls()
         try:
             tuple(TopologicalSorter(calls).static_order())

@@ -26,7 +26,7 @@ def taxi_tasks(taxi: Taxi) -> TaskGraph:
     def to_each_landmark(bound: Callable[..., Bool[Array, ""]]) -> tuple[Child, ...]:
         """Navigating, to the landmark of which `bound` is true."""
         return tuple(
-            Child(f"to-{name}", when=partial(bound, landmark=landmark), sees=_nothing)
+            Child(f"to-{name}", when=partial(bound, landmark=landmark), sees=_may_change)
             for landmark, name in enumerate(LANDMARK_NAMES)
         )
 
@@ -95,8 +95,13 @@ def _square_and_source(state: TaxiState) -> Int[Array, "2"]:
     return jnp.stack([_square(state), state.passenger.astype(jnp.int32)])
 
 
-def _square_and_destination(state: TaxiState) -> Int[Array, "2"]:
-    return jnp.stack([_square(state), state.destination.astype(jnp.int32)])
+def _square_and_destination(state: TaxiState) -> Int[Array, "3"]:
+    return jnp.stack([_square(state), state.destination.astype(jnp.int32), _may_change(state)])
+
+
+def _may_change(state: TaxiState) -> Int[Array, ""]:
+    """Whether the passenger may change his mind, which he never may if he is not fickle."""
+    return state.may_change.astype(jnp.int32)
 
 
 def _journey(state: TaxiState) -> Int[Array, "2"]:

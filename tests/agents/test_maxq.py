@@ -18,7 +18,7 @@ from lodestone.planning.solve import evaluate_policy
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.recursive import evaluate_choices, recursive_optimum
-from lodestone.subtasks.task_graph import tabulate_tasks
+from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph, tabulate_tasks
 
 EXPLORING = ((0.0, 0.5), (1.0, 0.3))
 DECAYING = ((0.0, 0.5), (0.5, 0.5), (1.0, 0.01))
@@ -104,3 +104,18 @@ def test_rules_without_a_limit_are_refused():
         maxq(MAXQConfig(), TwoRooms(), task_graph(TwoRooms()), Rules(), 100)
     with pytest.raises(InvalidConfig, match="call cost"):
         maxq(MAXQConfig(), TwoRooms(), task_graph(TwoRooms()), Rules(step_limit=10, call_cost=1.0), 100)
+
+
+def test_an_episode_ends_where_the_root_does():
+    """A root that is over after the left room: its episodes are told, and none of them is cut."""
+    rooms = TwoRooms()
+    _, leave, _ = task_graph(rooms).subtasks
+    root = Subtask("root", leave.ends, (Child("exit"),))
+    graph = TaskGraph((root, leave))
+    algorithm = maxq(MAXQConfig(), rooms, graph, Rules(discount=1.0, step_limit=100), 2000)
+    history = History(1, ("",) * 4)
+    for _, chunk in train(algorithm, [0], rounds_for(graph, 2000), rounds_for(graph, 2000)):
+        history.add(chunk)
+    episodes = history.episodes(0)
+    assert len(episodes.success) > 50
+    assert episodes.success.all()

@@ -12,8 +12,8 @@ from lodestone.report.studies import svg_of
 
 def test_a_short_run_in_a_small_maze(monkeypatch):
     monkeypatch.setattr(machines, "MAZE", machines.CorridorMaze(rows=2, columns=2, length=5))
-    monkeypatch.setattr(machines, "ARM_STEPS", {name: 8000 for name in machines.ARM_STEPS})
-    monkeypatch.setattr(machines, "MAZE_STEPS", {name: 60_000 for name in machines.MAZE_STEPS})
+    monkeypatch.setattr(machines, "ARM_STEPS", dict.fromkeys(machines.ARM_STEPS, 8000))
+    monkeypatch.setattr(machines, "MAZE_STEPS", dict.fromkeys(machines.MAZE_STEPS, 60000))
     monkeypatch.setattr(machines, "LOOKS", 4)
     study = machines.run(2, Silent())
     assert study.tables[0].rows[1][-2:] == (24.0, 76.0)

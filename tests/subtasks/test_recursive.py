@@ -14,7 +14,7 @@ from lodestone.planning.solve import evaluate_policy, value_iteration
 from lodestone.planning.tables import Tables, tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.recursive import check_abstraction, evaluate_choices, polled_policy, recursive_optimum
-from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
+from lodestone.subtasks.task_graph import Edge, TaskGraph, TaskTables, tabulate_tasks
 
 
 def prepare(environment, graph: TaskGraph | None = None) -> tuple[Tables, TaskTables]:
@@ -146,3 +146,75 @@ def test_a_child_must_end_with_its_caller():
     tables, tasks = prepare(taxi, replace(graph, subtasks=(early_root, late, *graph.subtasks[2:])))
     with pytest.raises(InvalidTaskGraph, match="'get' may go on when 'root'"):
         recursive_optimum(tasks, tables)
+
+
+@pytest.mark.parametrize("rewards", ["gym", "jair"])
+def test_the_taxis_abstraction_is_safe_also_for_a_fickle_passenger(rewards):
+    tables, tasks = prepare(Taxi(rewards, move_success=0.8, fickle=0.3))
+    check_abstraction(tasks, tables, recursive_optimum(tasks, tables))
+
+
+def test_what_a_pseudo_reward_tells_apart_must_be_seen():
+    """The moves of *exit* see the row alone, so neither how far the doors are nor what they are valued at."""
+    rooms = TwoRooms()
+    graph = task_graph(rooms)
+    root, leave, go = graph.subtasks
+    leave = replace(leave, children=tuple(replace(child, sees=lambda state: state.row) for child in leave.children))
+    tables, tasks = prepare(rooms, replace(graph, subtasks=(root, leave, go)))
+    with pytest.raises(InvalidTaskGraph, match=r"abstraction of 'exit/.*' is not safe"):
+        check_abstraction(tasks, tables, recursive_optimum(tasks, tables))
+
+
+def test_pseudo_rewards_are_part_of_inner_completions_alone():
+    """C~ - C is what the pseudo-reward of *exit* is worth at the door that its policy takes."""
+    rooms = TwoRooms()
+    tables, tasks = prepare(rooms)
+    found = recursive_optimum(tasks, tables)
+    states = tables.space.states
+    doors = {0: -2.0, 7: -7.0}
+    for name in ("exit/north", "exit/east"):
+        number = tasks.edge_names.index(name)
+        [start] = np.flatnonzero((states.row == 1) & (states.column == 3))
+        difference = found.inner_completions[number, start] - found.completions[number, start]
+        assert difference == pytest.approx(doors[0])
+    go = tasks.edge_names.index("go/north")
+    np.testing.assert_array_equal(found.inner_completions[go], found.completions[go])
+
+
+def test_what_has_no_chance_is_no_risk():
+    """Random worlds with one policy: working states, a way out to the end, a trap. The subtask *work* lasts as long as
+    one works; whoever cannot get into the trap must not be told that he may."""
+    rng, action, work = np.random.default_rng(0), 0, 2
+    for _ in range(250):
+        working = int(rng.integers(4, 25))
+        exit_, trap, end = working, working + 1, working + 2
+        successors, probs = np.zeros((end + 1, 1, 3), dtype=np.int32), np.zeros((end + 1, 1, 3))
+        for state in range(working):
+            successors[state, 0] = rng.choice(working + 2, 3, replace=False)
+            probs[state, 0, : rng.integers(1, 4)] = 1.0
+            probs[state, 0] *= rng.dirichlet(np.full(3, 0.7)) + 0.04
+        for state, following in ((exit_, end), (trap, trap), (end, end)):
+            successors[state, 0], probs[state, 0, 0] = following, 1.0
+        probs /= probs.sum(axis=2, keepdims=True)
+        terminal = np.arange(end + 1) == end
+        rewards = np.where(terminal[:, None, None], 0.0, -np.ones(probs.shape))
+        tables = Tables(None, successors, probs, rewards, terminal, np.full(end + 1, 1 / (end + 1)))
+        ends = np.stack([terminal, np.arange(end + 1) >= working])
+        tasks = TaskTables(
+            names=("act", "root", "work"),
+            num_actions=1,
+            edges=(Edge(0, work), Edge(0, action), Edge(1, action)),
+            bottom_up=(1, 0),
+            ends=ends,
+            available=np.stack([~ends[1], ends[1] & ~terminal, ~ends[1]]),
+            pseudo_rewards=np.zeros(ends.shape),
+            completion_slot=np.zeros((3, end + 1), dtype=np.int32),
+            reward_slot=np.zeros((1, end + 1), dtype=np.int32),
+            num_slots=1,
+        )
+        choices = np.where(ends, -1, np.array([[0], [2]]))
+        choices[0, ends[1] & ~terminal] = 1
+        found = evaluate_choices(tasks, tables, choices).values[0]
+        flat = evaluate_policy(tables, np.zeros(end + 1, dtype=int), 1.0)
+        np.testing.assert_array_equal(np.isneginf(found), np.isneginf(flat))
+        np.testing.assert_allclose(found[np.isfinite(flat)], flat[np.isfinite(flat)], rtol=1e-6)

@@ -38,6 +38,10 @@ REFUSED = [
     ((subtask("root", "fly"),), "calls 'fly'"),
     ((subtask("root", "north"), subtask("north", "east")), "name of a primitive action"),
     ((Subtask("root", never, (Child("north", when=never),)),), "may call none of its children"),
+    (
+        (Subtask("root", never, (Child("north", final=True),), pseudo_reward=never),),
+        "none of its children can be final",
+    ),
 ]
 
 
