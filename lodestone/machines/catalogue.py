@@ -27,7 +27,7 @@ def machines(environment: Environment) -> Hierarchy:
     raise InvalidConfig(f"There are no ready-made machines for {name}; magnet-arm, taxi and corridor-maze have some.")
 
 
-def as_options(environment: Environment, options: tuple[str, ...], others: tuple[Machine, ...]) -> Hierarchy:
+def machines_as_options(environment: Environment, options: tuple[str, ...], others: tuple[Machine, ...]) -> Hierarchy:
     """Machines as options beside the primitive actions: one choice, for ever, over all actions and `options`, each of
     which runs until it stops.
 

@@ -8,7 +8,7 @@ import pytest
 from lodestone.envs.chain import Chain
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.errors import InvalidConfig
-from lodestone.machines.catalogue import as_options, machines
+from lodestone.machines.catalogue import machines, machines_as_options
 from lodestone.machines.machine import Action, Branch, Machine, Predicate, Stop
 from lodestone.options.base import Primitives, Union
 from lodestone.options.catalogue import scripted_options
@@ -41,7 +41,7 @@ def test_an_option_as_a_machine_is_worth_what_the_option_is():
             "stop": Stop(),
         },
     )
-    process = joint_process(arm, as_options(arm, ("go-down",), (go_down,)))
+    process = joint_process(arm, machines_as_options(arm, ("go-down",), (go_down,)))
     found = joint_values(process, 0.9, tolerance=1e-12)
     tables = tabulate(arm)
     options = tabulate_options(Union((Primitives(arm.action_names), scripted_options(arm, ["go-down"]))), tables.space)
