@@ -10,20 +10,18 @@ reward or completion (MAXQ-Q with all-states updating).
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for a checkout that is not installed
 
+from command import run
+
 from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.maxq import EVENTS_PER_ROUND, MAXQConfig, maxq
-from lodestone.devices import use_all_cores
 from lodestone.envs.taxi import Taxi
 from lodestone.learning.loop import Algorithm, train
 from lodestone.machines.catalogue import machines
@@ -42,19 +40,15 @@ CHUNKS, REPEATS = 10, 3
 """The first chunk compiles and is left out; the fastest of the repeats counts."""
 
 
-def compiled_rate(algorithm: Algorithm, seeds: int, rounds: int) -> tuple[float, float]:
-    """(primitive steps, decisions) a second of all seeds together."""
-    best = (0.0, 0.0)
+def compiled_rate(algorithm: Algorithm, seeds: int, rounds: int) -> float:
+    """Primitive steps a second of all seeds together."""
+    best = 0.0
     for _ in range(REPEATS):
-        steps = decisions = 0
-        began = 0.0
+        steps, began = 0, 0.0
         for _, chunk in train(algorithm, range(seeds), rounds, rounds // CHUNKS):
-            if began:
-                steps += int(chunk.log.steps[chunk.log.valid].sum())
-                decisions += int(chunk.log.valid.sum())
+            steps += int(chunk.log.steps[chunk.log.valid].sum()) if began else 0
             began = began or chunk.seconds
-        seconds = chunk.seconds - began
-        best = max(best, (steps / seconds, decisions / seconds))
+        best = max(best, steps / (chunk.seconds - began))
     return best
 
 
@@ -204,7 +198,7 @@ def measure(seeds: int) -> dict[str, dict[str, float]]:
     }
     found = {}
     for name, (algorithm, loop, rounds) in learners.items():
-        steps, _ = compiled_rate(algorithm, seeds, rounds)
+        steps = compiled_rate(algorithm, seeds, rounds)
         plain, updates_per_step = plain_rate(loop)
         found[name] = {
             "primitive steps/s": steps,
@@ -215,24 +209,5 @@ def measure(seeds: int) -> dict[str, dict[str, float]]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=512, help="seeds trained at once (default: 512)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    arguments = parser.parse_args()
-    jax.config.update("jax_platforms", "cpu")
-    use_all_cores()
-
-    found = measure(arguments.seeds)
-    if arguments.json:
-        print(json.dumps({"cores": jax.device_count(), "seeds": arguments.seeds, **found}, indent=2))
-        return
-    print(f"Taxi, {arguments.seeds} seeds at once, {jax.device_count()} cores")
-    for name, rows in found.items():
-        print(name)
-        for row, value in rows.items():
-            print(f"    {row:40}{value:>16,.0f}")
-
-
 if __name__ == "__main__":
-    main()
+    run(__doc__ or "", "Taxi", measure)

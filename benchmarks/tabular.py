@@ -11,8 +11,6 @@ which no worker processes could exceed. Both count the updates that they make.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -23,9 +21,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for a checkout that is not installed
 
+from command import run
+
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.devices import use_all_cores
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.learning.loop import Algorithm, train
 from lodestone.options.base import Options, Primitives, Union
@@ -163,24 +162,5 @@ def measure(seeds: int) -> dict[str, dict[str, float]]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=512, help="seeds trained at once (default: 512)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    arguments = parser.parse_args()
-    jax.config.update("jax_platforms", "cpu")
-    use_all_cores()
-
-    found = measure(arguments.seeds)
-    if arguments.json:
-        print(json.dumps({"cores": jax.device_count(), "seeds": arguments.seeds, **found}, indent=2))
-        return
-    print(f"Four Rooms, {arguments.seeds} seeds at once, {jax.device_count()} cores")
-    for name, rows in found.items():
-        print(name)
-        for row, value in rows.items():
-            print(f"    {row:40}{value:>16,.0f}")
-
-
 if __name__ == "__main__":
-    main()
+    run(__doc__ or "", "Four Rooms", measure)
