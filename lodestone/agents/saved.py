@@ -23,6 +23,7 @@ from lodestone.errors import BadFile, InvalidConfig, LodestoneError
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
 from lodestone.machines.catalogue import machines
+from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Capped, Options, Primitives, Union
 from lodestone.options.catalogue import scripted_options, task_named
 from lodestone.options.execution import Rules
@@ -66,11 +67,12 @@ class Policy:
 
 @dataclass(frozen=True)
 class MachinePolicy:
-    """A trained policy over the choices of an environment's ready-made machines, of one or more seeds."""
+    """A trained policy over the choices of machines, of one or more seeds."""
 
     agent: str
     """Name of the algorithm."""
     environment: Environment
+    hierarchy: Hierarchy
     rules: Rules
     tables: Float[np.ndarray, "seeds N U"]
     """Q of every edge of every choice of `process`; -inf where it may not be taken."""
@@ -79,7 +81,7 @@ class MachinePolicy:
     @property
     def process(self) -> JointProcess:
         """The machines in the environment."""
-        return joint_process(self.environment, machines(self.environment))
+        return joint_process(self.environment, self.hierarchy)
 
 
 def save_policy(path: Path, policy: Policy | MachinePolicy) -> None:
@@ -104,6 +106,8 @@ def save_policy(path: Path, policy: Policy | MachinePolicy) -> None:
 
 
 def _save_machine_policy(path: Path, policy: MachinePolicy) -> None:
+    if policy.hierarchy != machines(policy.environment):
+        raise InvalidConfig("Only policies of an environment's ready-made machines can be saved.")
     header = {
         "kind": "policy",
         "version": __version__,
@@ -140,12 +144,13 @@ def load_policy(path: Path) -> Policy | MachinePolicy:
 
 def _build_machine_policy(environment: Environment, header: Recipe, arrays: Arrays) -> MachinePolicy:
     seeds = tuple(int(seed) for seed in header["seeds"])
-    process = joint_process(environment, machines(environment))
+    hierarchy = machines(environment)
+    process = joint_process(environment, hierarchy)
     template = {"tables": jax.ShapeDtypeStruct((len(seeds), *process.edges.shape), jnp.float32)}
     tables = np.asarray(_fill(template, {"['tables']": arrays["tables"]}, "")["tables"])
     if not np.array_equal(np.isneginf(tables), np.broadcast_to(~process.available, tables.shape)):
         raise BadFile("its values are of other machines.")
-    return MachinePolicy(str(header["agent"]), environment, Rules(**header["rules"]), tables, seeds)
+    return MachinePolicy(str(header["agent"]), environment, hierarchy, Rules(**header["rules"]), tables, seeds)
 
 
 def save_options(path: Path, options: Options, environment: Environment) -> None:

@@ -23,12 +23,13 @@ from lodestone.learning.history import History
 from lodestone.learning.loop import Algorithm, train
 from lodestone.machines.catalogue import machines
 from lodestone.machines.configurations import configurations
+from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Options
 from lodestone.options.execution import Rules
 from lodestone.planning.joint import joint_process
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
-from lodestone.subtasks.task_graph import tabulate_tasks
+from lodestone.subtasks.task_graph import TaskGraph, tabulate_tasks
 
 AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
 
@@ -53,17 +54,22 @@ def train_policy(
     length: int,
     seeds: Sequence[int],
     on_chunk: Callable[[History, float], bool] = lambda history, fraction: False,
+    *,
+    hierarchy: Hierarchy | None = None,
+    graph: TaskGraph | None = None,
 ) -> tuple[Policy | MachinePolicy, History]:
     """Train all seeds at once for `length` decisions each (tabular agents: primitive steps).
 
-    MAXQ and HAMQ learn in the environment's ready-made task graph or machines: their options must be the primitive
-    actions. What MAXQ leaves is the policy that asks anew from the root down at every step.
+    HAMQ learns in `hierarchy` and MAXQ in `graph` (default: what the environment has ready-made); their options must be
+    the primitive actions. What MAXQ leaves is the policy that asks anew from the root down at every step.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
     """
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
-    plan = _plan(config, environment, options, rules, length)
+    if isinstance(config, HAMQConfig):
+        hierarchy = hierarchy or machines(environment)
+    plan = _plan(config, environment, options, rules, length, hierarchy, graph)
     history = History(len(seeds), plan.choices)
     for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS)):
         history.add(chunk)
@@ -73,7 +79,8 @@ def train_policy(
             break
     learned = plan.learned(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(seeds)], plan.of_carry(carry)))
     if isinstance(config, HAMQConfig):
-        return MachinePolicy(name, environment, rules, learned, tuple(seeds)), history
+        assert hierarchy is not None
+        return MachinePolicy(name, environment, hierarchy, rules, learned, tuple(seeds)), history
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
@@ -97,7 +104,15 @@ class _Plan(NamedTuple):
     """Whether `rounds` is only a bound, as a round has no fixed number of steps."""
 
 
-def _plan(config: AgentConfig, environment: Environment, options: Options, rules: Rules, length: int) -> _Plan:
+def _plan(
+    config: AgentConfig,
+    environment: Environment,
+    options: Options,
+    rules: Rules,
+    length: int,
+    hierarchy: Hierarchy | None = None,
+    graph: TaskGraph | None = None,
+) -> _Plan:
     match config:
         case DQNConfig():
             return _Plan(
@@ -113,7 +128,7 @@ def _plan(config: AgentConfig, environment: Environment, options: Options, rules
             return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)
         case HAMQConfig():
             _refuse_options("HAMQ", options, environment)
-            hierarchy = machines(environment)
+            hierarchy = hierarchy or machines(environment)
             return _Plan(
                 algorithm=hamq(config, environment, hierarchy, rules, length),
                 # Every tick takes a step, or is a choice that leads straight to another one.
@@ -125,7 +140,7 @@ def _plan(config: AgentConfig, environment: Environment, options: Options, rules
             )
         case MAXQConfig():
             _refuse_options("MAXQ", options, environment)
-            graph = task_graph(environment)
+            graph = graph or task_graph(environment)
             tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
 
             def polled(learned: Learned) -> Float[Array, "seeds S A"]:

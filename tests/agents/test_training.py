@@ -1,0 +1,59 @@
+"""Training from settings to policies: machines and task graphs of one's own, and what is refused."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from lodestone.agents.hamq import HAMQConfig
+from lodestone.agents.maxq import MAXQConfig
+from lodestone.agents.playing import play, record
+from lodestone.agents.saved import MachinePolicy, save_policy
+from lodestone.agents.training import train_policy
+from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.two_rooms import TwoRooms
+from lodestone.errors import InvalidConfig
+from lodestone.machines.machine import every_action
+from lodestone.options.base import Primitives
+from lodestone.options.execution import Rules
+from lodestone.planning.solve import optimum
+from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph
+
+ARM = MagnetArm(rows=3, columns=3, bricks=2, tower_height=2)
+
+
+def test_machines_of_ones_own_are_learned_and_played_and_not_saved(tmp_path):
+    primitives = Primitives(ARM.action_names)
+    rules = Rules(discount=0.95, decision_limit=100)
+    policy, _ = train_policy(HAMQConfig(), ARM, primitives, rules, 40_000, [0, 1], hierarchy=every_action(ARM))
+    assert isinstance(policy, MachinePolicy)
+    best = optimum(ARM)
+    np.testing.assert_allclose(play(policy, jax.random.key(0)).total_reward, best.optimal_return)
+    assert len(record(policy, 0, jax.random.key(0), "hamq").option) == best.optimal_steps
+    with pytest.raises(InvalidConfig, match="ready-made machines can be saved"):
+        save_policy(tmp_path / "policy.safetensors", policy)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_task_graph_of_ones_own_is_learned():
+    """One subtask over all moves is flat Q-learning, and finds the flat optimum."""
+    rooms = TwoRooms()
+    moves = tuple(Child(name) for name in rooms.action_names)
+    graph = TaskGraph((Subtask("root", rooms.terminal, moves),))
+    rules = Rules(discount=1.0, step_limit=50)
+    policy, _ = train_policy(
+        MAXQConfig(((0.0, 0.5),)), rooms, Primitives(rooms.action_names), rules, 30_000, [0], graph=graph
+    )
+    keys = jax.random.split(jax.random.key(0), 20)
+    flat = np.array([play(policy, key).total_reward[0] for key in keys])
+    assert flat.mean() > -8.5
+    assert flat.min() >= -14
+
+
+def test_hierarchies_take_no_options_and_need_a_program():
+    rooms = TwoRooms()
+    with pytest.raises(InvalidConfig, match="no ready-made machines"):
+        train_policy(HAMQConfig(), rooms, Primitives(rooms.action_names), Rules(step_limit=9), 100, [0])
+    with pytest.raises(InvalidConfig, match="takes no options"):
+        train_policy(MAXQConfig(), rooms, Primitives(("a", "b")), Rules(step_limit=9), 100, [0])
