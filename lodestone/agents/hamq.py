@@ -364,15 +364,22 @@ class JointEpisode(NamedTuple):
 
 
 def play_choices(
-    process: JointProcess, policy: Int[np.ndarray, " N"], rng: np.random.Generator, max_steps: int
+    process: JointProcess,
+    policy: Int[np.ndarray, " N"],
+    rng: np.random.Generator,
+    max_steps: int,
+    max_choices: int | None = None,
 ) -> JointEpisode:
-    """One episode of a policy over choices, of at most `max_steps` primitive steps."""
+    """One episode of a policy over choices, of at most `max_steps` primitive steps and `max_choices` choices."""
     begins = np.flatnonzero(process.initial_probs)
     joint = int(rng.choice(begins, p=process.initial_probs[begins] / process.initial_probs[begins].sum()))
-    joints, edges, rewards, states, steps = [joint], [], [], [], 0
+    joints, edges, rewards, states, steps, choices = [joint], [], [], [], 0, 0
     while joint != process.end and steps < max_steps:
         state = process.state[joint]
         if joint < process.num_choices:
+            if choices == max_choices:
+                break
+            choices += 1
             edge, reward = int(policy[joint]), 0.0
             joint = int(process.edges[joint, edge])
         else:

@@ -121,6 +121,7 @@ class Values(NamedTuple):
 
 
 FORBIDDEN = -2
+"""In place of a slot: the call is not allowed."""
 
 
 class Arrays(NamedTuple):
@@ -344,16 +345,25 @@ def chooser(
 
 def polled_values(
     config: MAXQConfig, environment: Environment, graph: TaskGraph, learned: Learned
-) -> Float[np.ndarray, "S A"]:
-    """What one seed expects of each primitive action where every step asks anew from the root down: the rewards and
-    completions along the best path to the action, -inf where there is none. Its maximum is the action that polling
-    takes, also where pseudo-rewards choose another path than the best."""
+) -> Float[np.ndarray, "N S A"]:
+    """What each of N seeds expects of each primitive action where every step asks anew from the root down: the rewards
+    and completions along the best path to the action, -inf where there is none. The maximum of a row is the action that
+    polling takes, also where pseudo-rewards choose another path than the best."""
     tasks, everywhere = _everywhere(config, environment, graph)
-    values = jax.jit(everywhere)(jax.tree.map(jnp.asarray, learned))
+    values = jax.tree.map(np.asarray, jax.jit(jax.vmap(everywhere))(jax.tree.map(jnp.asarray, learned)))
+    seeds = zip(np.asarray(learned.values), values.nodes, values.choices, strict=True)
+    return np.stack([_polled_values(tasks, *seed) for seed in seeds])
+
+
+def _polled_values(
+    tasks: TaskTables,
+    stored: Float[np.ndarray, " slots"],
+    nodes: Float[np.ndarray, "S A+T"],
+    choices: Int[np.ndarray, "S T"],
+) -> Float[np.ndarray, "S A"]:
     states = np.arange(tasks.ends.shape[1])
     slots = tasks.completion_slot
-    completions = np.where(slots >= 0, np.asarray(learned.values)[slots], 0.0)
-    nodes = np.asarray(values.nodes)
+    completions = np.where(slots >= 0, stored[slots], 0.0)
     paths = {action: np.full((len(states), tasks.num_actions), -np.inf) for action in range(tasks.num_actions)}
     for action, path in paths.items():
         path[:, action] = nodes[:, action]
@@ -364,7 +374,7 @@ def polled_values(
         ]
         paths[tasks.num_actions + subtask] = np.max(calls, axis=0)
     found = np.where(tasks.ends[0][:, None], 0.0, paths[tasks.num_actions])
-    polled = polled_policy(tasks, np.where(tasks.ends, -1, np.asarray(values.choices).T))
+    polled = polled_policy(tasks, np.where(tasks.ends, -1, choices.T))
     found[states, polled] = np.nextafter(found.max(axis=1).astype(np.float32), np.float32(np.inf))
     return found.astype(np.float32)
 

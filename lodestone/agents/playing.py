@@ -82,9 +82,10 @@ def _of_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> Epi
 
 
 def _play_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> JointEpisode:
-    limit = min(policy.rules.step_limit or MAX_STEPS, MAX_STEPS)
+    max_steps = min(policy.rules.step_limit or MAX_STEPS, MAX_STEPS)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    return play_choices(policy.process, greedy_edges(policy.tables[position]), rng, limit)
+    edges = greedy_edges(policy.tables[position])
+    return play_choices(policy.process, edges, rng, max_steps, policy.rules.decision_limit)
 
 
 def record(policy: Policy | MachinePolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:

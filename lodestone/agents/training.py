@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import PyTree
 
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
-from lodestone.agents.maxq import Learned, MAXQConfig, as_configured, maxq, polled_values, rounds_for
+from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.saved import MachinePolicy, Policy
 from lodestone.envs.base import Environment
@@ -142,17 +142,12 @@ def _plan(
             _refuse_options("MAXQ", options, environment)
             graph = graph or task_graph(environment)
             tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
-
-            def polled(learned: Learned) -> Float[Array, "seeds S A"]:
-                seeds = [Learned(*arrays) for arrays in zip(*learned, strict=True)]
-                return jnp.stack([polled_values(config, environment, graph, seed) for seed in seeds])
-
             return _Plan(
                 algorithm=maxq(config, environment, graph, rules, length),
                 rounds=rounds_for(graph, length),
                 of_carry=lambda carry: carry.learned,
                 choices=tasks.edge_names,
-                learned=polled,
+                learned=lambda learned: jnp.asarray(polled_values(config, environment, graph, learned)),
                 ends_by_steps=True,
             )
 

@@ -13,7 +13,6 @@ from graphlib import CycleError, TopologicalSorter
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -186,18 +185,12 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
         if name not in actions:
             raise InvalidTaskGraph(f"There is no action {name!r} whose reward could depend on less than the state.")
 
-    def everywhere(ask: Callable[[State], Array]) -> np.ndarray:
-        ask_batch = jax.jit(jax.vmap(ask))
-        parts = [
-            np.asarray(ask_batch(states))[: rows.stop - rows.start] for rows, states in state_batches(tables.space)
-        ]
-        return np.concatenate(parts)
-
-    ends = np.stack([everywhere(subtask.ends).astype(bool) | tables.terminal for subtask in graph.subtasks])
+    everywhere = _answers(graph, tables)
+    ends = np.stack([everywhere[subtask.ends].astype(bool) | tables.terminal for subtask in graph.subtasks])
     pseudo_rewards = np.zeros(ends.shape)
     for number, subtask in enumerate(graph.subtasks):
         if subtask.pseudo_reward is not None:
-            pseudo_rewards[number] = np.where(ends[number], everywhere(subtask.pseudo_reward), 0.0)
+            pseudo_rewards[number] = np.where(ends[number], everywhere[subtask.pseudo_reward], 0.0)
 
     edges, available, slots, next_slot = [], [], [], 0
     for number, subtask in enumerate(graph.subtasks):
@@ -205,12 +198,12 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
             edge = Edge(number, names.index(child.name))
             allowed = ~ends[number]
             if child.when is not None:
-                allowed = allowed & everywhere(child.when).astype(bool)
+                allowed = allowed & everywhere[child.when].astype(bool)
             if edge.child >= len(actions):
                 allowed = allowed & ~ends[edge.child - len(actions)]
             slot = np.full(tables.num_states, -1)
             if not child.final:
-                slot[allowed] = next_slot + _classes(child.sees, everywhere, tables.num_states, allowed)
+                slot[allowed] = next_slot + _classes(everywhere[child.sees] if child.sees else None, allowed)
                 next_slot = max(next_slot, int(slot.max()) + 1)
             edges.append(edge)
             available.append(allowed)
@@ -224,7 +217,8 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
     live, reward_slots = ~tables.terminal, []
     for name in actions:
         slot = np.full(tables.num_states, -1)
-        slot[live] = next_slot + _classes(graph.rewards_see.get(name), everywhere, tables.num_states, live)
+        sees = graph.rewards_see.get(name)
+        slot[live] = next_slot + _classes(everywhere[sees] if sees else None, live)
         next_slot = max(next_slot, int(slot.max()) + 1)
         reward_slots.append(slot)
 
@@ -243,14 +237,26 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
     )
 
 
-def _classes(
-    sees: Feature | None,
-    everywhere: Callable[[Feature], np.ndarray],
-    num_states: int,
-    where: Bool[np.ndarray, " S"],
-) -> Int[np.ndarray, " N"]:
-    """Numbers from 0 of the N states of `where`, alike for those that are seen alike."""
-    if sees is None:
+def _answers(graph: TaskGraph, tables: Tables) -> dict[Callable[[State], Array], np.ndarray]:
+    """What each of the graph's functions answers in every state; all of them are one compilation."""
+    asked = list(graph.rewards_see.values())
+    for subtask in graph.subtasks:
+        asked += [subtask.ends, *([subtask.pseudo_reward] if subtask.pseudo_reward else [])]
+        asked += [ask for child in subtask.children for ask in (child.when, child.sees) if ask]
+    asked = list(dict.fromkeys(asked))
+
+    @jax.jit
+    def ask_batch(states: State) -> list[Array]:
+        return [jax.vmap(ask)(states) for ask in asked]
+
+    batches = []
+    for rows, states in state_batches(tables.space):
+        batches.append([np.asarray(answer)[: rows.stop - rows.start] for answer in ask_batch(states)])
+    return {ask: np.concatenate(parts) for ask, parts in zip(asked, zip(*batches, strict=True), strict=True)}
+
+
+def _classes(seen: np.ndarray | None, where: Bool[np.ndarray, " S"]) -> Int[np.ndarray, " N"]:
+    """Numbers from 0 of the N states of `where`, alike for those where the same is seen; None for the whole state."""
+    if seen is None:
         return np.arange(int(where.sum()))
-    seen = everywhere(lambda state: jnp.ravel(sees(state))).reshape(num_states, -1)[where]
-    return np.unique(seen, axis=0, return_inverse=True)[1].reshape(-1)
+    return np.unique(seen.reshape(len(where), -1)[where], axis=0, return_inverse=True)[1].reshape(-1)

@@ -37,6 +37,10 @@ def learn(config: MAXQConfig, environment: Environment, rules: Rules, steps: int
     return [Learned(*(leaf[seed] for leaf in learned)) for seed in range(seeds)], history
 
 
+def stacked(seeds: list[Learned]) -> Learned:
+    return Learned(*(np.stack(leaves) for leaves in zip(*seeds, strict=True)))
+
+
 @pytest.mark.parametrize("pseudo_rewards", [True, False])
 @pytest.mark.parametrize("all_states", [True, False])
 def test_two_rooms(pseudo_rewards, all_states):
@@ -45,8 +49,7 @@ def test_two_rooms(pseudo_rewards, all_states):
     seeds, _ = learn(config, rooms, Rules(discount=1.0, step_limit=50), 60_000)
     tables = tabulate(rooms)
     tasks = tabulate_tasks(as_configured(config, task_graph(rooms)), rooms, tables)
-    together = Learned(*(np.stack(leaves) for leaves in zip(*seeds, strict=True)))
-    for choices in chooser(config, rooms, task_graph(rooms))(together):
+    for choices in chooser(config, rooms, task_graph(rooms))(stacked(seeds)):
         found = evaluate_choices(tasks, tables, choices).values[0]
         assert tables.initial_mean(found) == pytest.approx(-7.75 if pseudo_rewards else -8.5)
 
@@ -65,8 +68,8 @@ def test_learned_values_are_the_exact_ones(environment, discount, steps, call):
     exact, begins = recursive_optimum(tasks, tables, discount), tables.initial_probs > 0
     number = tasks.edge_names.index(call)
     slots = tasks.completion_slot[number]
-    for learned in seeds:
-        root = polled_values(config, environment, graph, learned).max(axis=1)
+    polled = polled_values(config, environment, graph, stacked(seeds))
+    for learned, root in zip(seeds, polled.max(axis=2), strict=True):
         assert np.median(np.abs(root - exact.values[0])[begins]) < 0.02
         used = (slots >= 0) & (learned.values[slots] != 0)
         assert used.sum() > 20
@@ -82,8 +85,8 @@ def test_the_taxi_is_learned_to_the_optimum(abstraction):
     config = MAXQConfig(((0.0, 0.25 if abstraction else 0.5),), ((0.0, 0.3), (0.8, 0.02)), abstraction=abstraction)
     seeds, history = learn(config, taxi, Rules(discount=1.0, step_limit=1000), 60_000 if abstraction else 250_000)
     tables = tabulate(taxi)
-    for number, learned in enumerate(seeds):
-        policy = polled_values(config, taxi, task_graph(taxi), learned).argmax(axis=1)
+    policies = polled_values(config, taxi, task_graph(taxi), stacked(seeds)).argmax(axis=2)
+    for number, policy in enumerate(policies):
         assert tables.initial_mean(evaluate_policy(tables, policy, 1.0)) == pytest.approx(7.93)
         assert history.episodes(number).success[-100:].all()
         assert history.episodes(number).total_reward[-200:].mean() > 6

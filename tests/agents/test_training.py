@@ -8,7 +8,7 @@ import pytest
 
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.maxq import MAXQConfig
-from lodestone.agents.playing import play, record
+from lodestone.agents.playing import play, play_many, record
 from lodestone.agents.saved import MachinePolicy, save_policy
 from lodestone.agents.training import train_policy
 from lodestone.envs.magnet_arm import MagnetArm
@@ -36,6 +36,15 @@ def test_machines_of_ones_own_are_learned_and_played_and_not_saved(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_machines_are_played_within_their_limits():
+    """A policy that knows nothing lets go for ever, one choice a step."""
+    rules = Rules(discount=0.95, decision_limit=7)
+    policy, _ = train_policy(HAMQConfig(((0.0, 0.0),)), ARM, Primitives(ARM.action_names), rules, 100, [0])
+    episode = play(policy, jax.random.key(0))
+    assert int(episode.decisions[0]) == 7
+    assert not episode.success[0]
+
+
 def test_a_task_graph_of_ones_own_is_learned():
     """One subtask over all moves is flat Q-learning, and finds the flat optimum."""
     rooms = TwoRooms()
@@ -45,8 +54,7 @@ def test_a_task_graph_of_ones_own_is_learned():
     policy, _ = train_policy(
         MAXQConfig(((0.0, 0.5),)), rooms, Primitives(rooms.action_names), rules, 30_000, [0], graph=graph
     )
-    keys = jax.random.split(jax.random.key(0), 20)
-    flat = np.array([play(policy, key).total_reward[0] for key in keys])
+    flat = play_many(policy, jax.random.key(0), 20).total_reward[0]
     assert flat.mean() > -8.5
     assert flat.min() >= -14
 
