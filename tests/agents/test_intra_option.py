@@ -107,3 +107,19 @@ def test_what_cannot_be_learned_from_single_steps_is_refused() -> None:
         intra_option_q_learning(IntraOptionConfig(behaviour="primitives"), corridor, walk, Rules(), 100)
     with pytest.raises(InvalidConfig, match="behaviour is 'both'"):
         IntraOptionConfig(behaviour="both")
+
+
+def test_the_maximum_runs_over_what_may_start() -> None:
+    """Random options without the primitives, so that one that may not start can be the best."""
+    mdp, options = random_mdp(16), random_options(16)
+    tables = tabulate(mdp)
+    described = tabulate_options(options, tables.space)
+    exact = option_value_iteration(tables, described, 0.9).option_values
+    everywhere = described._replace(initiation=np.ones_like(described.initiation))
+    counted = described.initiation.T
+    assert np.abs(option_value_iteration(tables, everywhere, 0.9).option_values - exact)[counted].max() > 0.5
+    config = IntraOptionConfig(((0.0, 0.5), (1.0, 0.005)), ((0.0, 1.0),))
+    algorithm = intra_option_q_learning(config, mdp, options, Rules(discount=0.9, step_limit=50), 64_000)
+    for carry, _ in train(algorithm, range(16), 2000, 2000):
+        learned = np.asarray(carry.table).mean(axis=0)
+    np.testing.assert_allclose(learned[counted], exact[counted], atol=0.1)

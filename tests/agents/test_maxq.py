@@ -122,3 +122,14 @@ def test_an_episode_ends_where_the_root_does():
     episodes = history.episodes(0)
     assert len(episodes.success) > 50
     assert episodes.success.all()
+
+
+def test_a_limit_teaches_nothing_about_the_calls_that_it_cuts():
+    """After one step the stack is left: the action's reward is known, and what follows *exit* is not."""
+    rooms = TwoRooms()
+    [learned], _ = learn(MAXQConfig(), rooms, Rules(discount=1.0, step_limit=1), 500, seeds=1)
+    tasks = tabulate_tasks(task_graph(rooms), rooms, tabulate(rooms))
+    slots = tasks.completion_slot[tasks.edge_names.index("root/exit")]
+    assert (learned.values[slots[slots >= 0]] == 0).all()
+    rewards = tasks.reward_slot[rooms.action_names.index("north")]
+    assert learned.values[rewards[rewards >= 0]].min() < -0.2
