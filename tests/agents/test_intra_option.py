@@ -122,4 +122,5 @@ def test_the_maximum_runs_over_what_may_start() -> None:
     algorithm = intra_option_q_learning(config, mdp, options, Rules(discount=0.9, step_limit=50), 64_000)
     for carry, _ in train(algorithm, range(16), 2000, 2000):
         learned = np.asarray(carry.table).mean(axis=0)
-    np.testing.assert_allclose(learned[counted], exact[counted], atol=0.1)
+    # A maximum of noisy values is too high by about 0.1 here; over all options it would be by 2.
+    np.testing.assert_allclose(learned[counted], exact[counted], atol=0.25)
