@@ -1,0 +1,5 @@
+"""The command line."""
+
+from lodestone.cli.program import main
+
+__all__ = ["main"]

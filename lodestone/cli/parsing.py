@@ -1,0 +1,36 @@
+"""From words to settings: what every command's parsing shares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import tyro
+from tyro.conf import OmitArgPrefixes
+
+from lodestone.envs.base import Environment
+from lodestone.envs.registry import ENVIRONMENTS, environment_class
+from lodestone.errors import InvalidConfig, check_name
+
+
+def take_name(kind: str, known: tuple[str, ...], command: str, words: list[str]) -> tuple[str, list[str]]:
+    """The first word, a name, and the rest. Raises `InvalidConfig` without a word and `UnknownName`."""
+    if not words or words[0].startswith("-"):
+        raise InvalidConfig(f"`lodestone {command}` needs the name of an {kind}; there are: {', '.join(known)}.")
+    check_name(kind, words[0], known)
+    return words[0], words[1:]
+
+
+def take_environment(command: str, words: list[str]) -> tuple[str, type[Environment], list[str]]:
+    """An environment's name, its class, and the rest. Raises `InvalidConfig` and `UnknownName`."""
+    name, rest = take_name("environment", tuple(ENVIRONMENTS), command, words)
+    return name, environment_class(name), rest
+
+
+def settings_of(command: Any, *kinds: type) -> Any:
+    """A command's settings for an agent and an environment that are known only now."""
+    return command[kinds]
+
+
+def parse(settings: Any, command: str, words: list[str]) -> Any:
+    """Parsing errors leave with exit code 2 from inside tyro, after one boxed sentence."""
+    return tyro.cli(settings, args=words, prog=f"lodestone {command}", config=(OmitArgPrefixes,))

@@ -1,0 +1,192 @@
+"""`lodestone train AGENT ENVIRONMENT`: train an agent, several seeds at once."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import jax
+from rich.console import Console
+from rich.table import Table
+
+from lodestone.agents.intra_option import IntraOptionConfig
+from lodestone.agents.maxq import MAXQConfig, as_configured
+from lodestone.agents.playing import episodes_to_judge, play_many
+from lodestone.agents.run_folder import RunFolder
+from lodestone.agents.saved import load_options
+from lodestone.agents.training import AGENTS, AgentConfig, check_training, train_policy
+from lodestone.cli.parsing import parse, settings_of, take_environment, take_name
+from lodestone.cli.printing import print_json
+from lodestone.console import ConsoleProgress
+from lodestone.envs.base import Environment
+from lodestone.envs.registry import describe_environment
+from lodestone.errors import InvalidConfig, InvalidTaskGraph, TooManyStates
+from lodestone.experiments.magnet_tower import OPTION_CAP
+from lodestone.learning.history import History
+from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.catalogue import named_options
+from lodestone.options.execution import Rules
+from lodestone.options.tabular import TabularOptions
+from lodestone.planning.option_models import check_available, tabulate_options
+from lodestone.planning.solve import optimum
+from lodestone.planning.tables import tabulate
+from lodestone.subtasks.catalogue import task_graph
+from lodestone.subtasks.recursive import check_abstraction, recursive_optimum
+from lodestone.subtasks.task_graph import tabulate_tasks
+
+AgentT = TypeVar("AgentT", bound=AgentConfig)
+EnvironmentT = TypeVar("EnvironmentT", bound=Environment)
+
+
+@dataclass(frozen=True)
+class Train(Generic[AgentT, EnvironmentT]):
+    """Train an agent on an environment, several seeds at once."""
+
+    agent: AgentT
+    environment: EnvironmentT
+    rules: Rules = dataclasses.field(default_factory=lambda: Rules(decision_limit=200))
+    steps: int = 50_000
+    """Primitive steps per seed; with options, training ends at the first report after so many."""
+    seed: int = 0
+    """The first seed."""
+    seeds: int = 1
+    """How many seeds, trained at once."""
+    options: tuple[str, ...] = ()
+    """Ready-made options by name, or one file of saved options."""
+    option_cap: int | None = None
+    """Steps after which an option is stopped. Default: 21 for scripts and networks, none for exact tables; none for
+    agents that learn within options, which take no caps."""
+    primitives: bool = True
+    """Whether the agent may choose primitive actions besides the options."""
+    out: Path | None = None
+    """Folder for config.json, metrics.jsonl and policy.safetensors; without it nothing is saved."""
+    json: bool = False
+    """Print one JSON object at the end."""
+
+
+def run(words: list[str]) -> None:
+    """Parse the words after `train` and train."""
+    agent, rest = take_name("agent", tuple(AGENTS), "train", words)
+    name, environment, rest = take_environment(f"train {agent}", rest)
+    _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest), agent)
+
+
+def _train(train: Train, agent: str) -> None:
+    if train.seeds < 1:
+        raise InvalidConfig(f"seeds is {train.seeds}, but must be at least 1.")
+    if train.steps < 1:
+        raise InvalidConfig(f"steps is {train.steps}, but must be at least 1.")
+    environment, rules = train.environment, train.rules
+    options = _choose_options(train)
+    check_training(train.agent, environment, options, rules)
+    if isinstance(train.agent, MAXQConfig):
+        _warn_of_unsafe_abstraction(train.agent, environment, rules.discount)
+    seeds = tuple(range(train.seed, train.seed + train.seeds))
+    folder = None
+    if train.out is not None:
+        config = {
+            "agent": {"name": agent, **dataclasses.asdict(train.agent)},
+            "environment": describe_environment(environment),
+            "rules": dataclasses.asdict(rules),
+            "options": list(options.names),
+            "steps": train.steps,
+            "seeds": list(seeds),
+        }
+        folder = RunFolder(train.out, config)
+    with ConsoleProgress(1.0) as progress:
+        progress.begin(f"{agent} on {describe_environment(environment)['name']}", 1.0)
+
+        def tell(history: History, fraction: float) -> bool:
+            steps = min(history.taken(position)[1] for position in range(len(seeds)))
+            returns = [history.episodes(position).total_reward[-50:] for position in range(len(seeds))]
+            means = " ".join(f"{values.mean():.1f}" if len(values) else "-" for values in returns)
+            progress.advance(max(fraction, min(1.0, steps / train.steps)), f"{steps:,} steps, mean return {means}")
+            if folder is not None:
+                folder.log(history, seeds)
+            return steps >= train.steps
+
+        policy, history = train_policy(train.agent, environment, options, rules, train.steps, seeds, tell)
+    if folder is not None:
+        folder.finish(policy)
+
+    try:
+        best = optimum(environment)
+    except TooManyStates:
+        best = None
+    judged = episodes_to_judge(environment)
+    greedy = jax.tree.map(lambda leaf: leaf.mean(axis=1), play_many(policy, jax.random.key(0), judged))
+    content: dict[str, Any] = {
+        "agent": agent,
+        "environment": describe_environment(environment),
+        "optimal_return": best.optimal_return if best else None,
+        "optimal_steps": best.optimal_steps if best else None,
+        "seeds": [
+            {
+                "seed": seed,
+                "decisions": history.taken(position)[0],
+                "steps": history.taken(position)[1],
+                "episodes": len(history.episodes(position).total_reward),
+                "greedy_return": float(greedy.total_reward[position]),
+                "greedy_steps": float(greedy.steps[position]),
+                "greedy_decisions": float(greedy.decisions[position]),
+                "success": float(greedy.success[position]),
+                "gap": best.optimal_return - float(greedy.total_reward[position]) if best else None,
+            }
+            for position, seed in enumerate(seeds)
+        ],
+        "greedy_episodes": judged,
+        "seconds": round(history.seconds, 3),
+        "out": str(train.out) if train.out else None,
+    }
+    if train.json:
+        print_json(content)
+        return
+    title = f"Greedy policies after training ({history.seconds:.0f} s)"
+    table = Table(title=title if judged == 1 else f"{title}, means of {judged} episodes", title_justify="left")
+    for column in ("seed", "steps trained", "return", "optimal return", "steps", "decisions", "reached the goal"):
+        table.add_column(column, justify="right")
+    for row in content["seeds"]:
+        table.add_row(
+            str(row["seed"]),
+            f"{row['steps']:,}",
+            f"{row['greedy_return']:g}",
+            f"{best.optimal_return:g}" if best else "unknown",
+            f"{row['greedy_steps']:g}",
+            f"{row['greedy_decisions']:g}",
+            f"{row['success']:.0%}",
+        )
+    Console().print(table)
+    if train.out is not None:
+        print(f"Saved in {train.out}; `lodestone watch {train.out}` plays it.")
+
+
+def _choose_options(train: Train) -> Options:
+    """What the agent chooses from. Raises `NoOptionAvailable` where a reachable state has nothing."""
+    environment = train.environment
+    parts: list[Options] = [Primitives(environment.action_names)] if train.primitives else []
+    if train.options:
+        first = Path(train.options[0])
+        is_file = len(train.options) == 1 and (first.suffix or first.exists())
+        temporal = load_options(first, environment) if is_file else named_options(environment, train.options)
+        cap = train.option_cap
+        if cap is None and not isinstance(train.agent, IntraOptionConfig) and not isinstance(temporal, TabularOptions):
+            cap = OPTION_CAP
+        parts.append(temporal if cap is None else Capped(temporal, cap))
+    options = Union(tuple(parts))
+    if not train.primitives:
+        tables = tabulate(environment)
+        check_available(tables, tabulate_options(options, tables.space))
+    return options
+
+
+def _warn_of_unsafe_abstraction(config: MAXQConfig, environment: Environment, discount: float) -> None:
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(as_configured(config, task_graph(environment)), environment, tables)
+    try:
+        check_abstraction(tasks, tables, recursive_optimum(tasks, tables, discount))
+    except InvalidTaskGraph as error:
+        hint = "try --discount 1 or --no-abstraction"
+        print(f"lodestone: note: {error} What is learned is not exact; {hint}.", file=sys.stderr)
