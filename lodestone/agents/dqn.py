@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
 from lodestone.envs.base import Environment, example_state
 from lodestone.errors import InvalidConfig
+from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.collecting import collect, no_decisions, start_actors
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
@@ -142,16 +143,10 @@ def update(
     observe = jax.vmap(environment.observe)
     batch = batch._replace(obs=observe(batch.obs), next_obs=observe(batch.next_obs))
     value, gradient = jax.value_and_grad(partial(loss, config))(learner.network, learner.target, batch)
-    gradient = jax.tree.map(lambda leaf: _clip(leaf, config.max_gradient_norm), gradient)
-    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to an integer power, which strictness forbids
-        direction, adam = optax.scale_by_adam(eps=config.adam_epsilon).update(gradient, learner.adam)
-    network = jax.tree.map(lambda old, step: old - learning_rate * step, learner.network, direction)
+    network, adam = adam_step(
+        learner.network, gradient, learner.adam, learning_rate, config.adam_epsilon, config.max_gradient_norm
+    )
     return learner._replace(network=network, adam=adam), value / config.batch_size
-
-
-def _clip(gradient: Array, max_norm: float) -> Array:
-    norm = jnp.sqrt(jnp.sum(jnp.square(gradient)))
-    return gradient * jnp.minimum(1.0, max_norm / jnp.maximum(norm, 1e-12))
 
 
 def option_values(network: QNetwork, environment: Environment, state: State) -> Float[Array, " O"]:
@@ -176,7 +171,7 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
         learner = Learner(
             network=network,
             target=network,
-            adam=optax.scale_by_adam().init(network),
+            adam=start_adam(network),
             replay=empty_replay(example, capacity),
         )
         return Carry(learner, start_actors(environment, actor_key, config.environments), jnp.int32(0), key)

@@ -256,13 +256,21 @@ def _describe_network(network: QNetwork) -> Recipe:
             strides=tuple(layer.stride for layer in network.convolutions),
             channels=tuple(layer.weight.shape[-1] for layer in network.convolutions),
             hidden=tuple(layer.weight.shape[-1] for layer in network.layers[:-1]),
+            pooling=network.pooling,
         )
     )
 
 
+WIDTHS = ("kernels", "strides", "channels", "hidden")
+"""The numbers of a network's shape."""
+
+
 def _network_template(recipe: Recipe, environment: Environment, outputs: int, count: int) -> QNetwork:
     """Shapes and dtypes of `count` stacked networks for this environment's observations."""
-    config = NetworkConfig(**{name: tuple(int(number) for number in numbers) for name, numbers in recipe.items()})
+    widths = {
+        name: tuple(int(number) for number in recipe[name]) for name in ("kernels", "strides", "channels", "hidden")
+    }
+    config = NetworkConfig(**widths, pooling=bool(recipe["pooling"]))
     observation = jax.eval_shape(environment.observe, example_state(environment))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
     return jax.eval_shape(jax.vmap(lambda key: init_q_network(config, observation.shape, outputs, key)), keys)

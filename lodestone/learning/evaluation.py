@@ -47,6 +47,8 @@ class Trace(NamedTuple):
     available: Bool[Array, "T O"]
     reward: Float[Array, " T"]
     """The step's primitive reward."""
+    termination: Float[Array, "T O"]
+    """Probability that each option, had it run until the state before the step, would stop there."""
 
 
 def play_episode(
@@ -96,6 +98,7 @@ def trace_episode(
             values=state_values,
             available=available,
             reward=decision.episode_return - actor.episode_return,
+            termination=options.termination(actor.state),
         )
         return (next_actor, live & ~decision.episode_ended, key), trace
 

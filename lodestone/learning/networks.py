@@ -7,13 +7,14 @@ products, and it turns into grouped convolutions when seeds are vmapped. So a co
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Num, PRNGKeyArray
+from jaxtyping import Array, Float, Num, PRNGKeyArray, PyTree
 
 from lodestone.errors import InvalidConfig
 
@@ -33,6 +34,9 @@ class NetworkConfig:
     """Output channels of each convolution."""
     hidden: tuple[int, ...] = (256,)
     """Widths of the hidden layers."""
+    pooling: bool = False
+    """Whether the hidden layers see each channel's maximum over the picture instead of all its pixels: the network then
+    takes pictures of any size."""
 
     def __post_init__(self) -> None:
         if not len(self.kernels) == len(self.strides) == len(self.channels):
@@ -42,6 +46,8 @@ class NetworkConfig:
             )
         if any(number < 1 for number in (*self.kernels, *self.strides, *self.channels, *self.hidden)):
             raise InvalidConfig("kernels, strides, channels and hidden widths must be at least 1.")
+        if self.pooling and not self.kernels:
+            raise InvalidConfig("pooling needs convolutions.")
 
 
 class Convolution(eqx.Module):
@@ -109,29 +115,52 @@ class Linear(eqx.Module):
         return x @ self.weight + self.bias
 
 
-class QNetwork(eqx.Module):
-    """Observation -> one value per option."""
+class Trunk(eqx.Module):
+    """Observation -> features: every layer is followed by a ReLU."""
 
     convolutions: tuple[Convolution, ...]
     layers: tuple[Linear, ...]
+    pooling: bool = eqx.field(static=True, default=False)
 
-    def __call__(self, observation: Num[Array, "..."]) -> Float[Array, " O"]:
+    def __call__(self, observation: Num[Array, "..."]) -> Float[Array, " F"]:
         """A uint8 picture is scaled to [0, 1]; anything else is taken as it is."""
         x = observation.astype(jnp.float32)
         if observation.dtype == jnp.uint8:
             x = x * jnp.float32(1 / 255)
         for convolution in self.convolutions:
             x = jax.nn.relu(convolution(x))
-        x = x.ravel()
-        for layer in self.layers[:-1]:
+        x = jnp.max(x, axis=(0, 1)) if self.pooling else x.ravel()
+        for layer in self.layers:
             x = jax.nn.relu(layer(x))
-        return self.layers[-1](x)
+        return x
+
+
+class QNetwork(eqx.Module):
+    """Observation -> one value per option."""
+
+    convolutions: tuple[Convolution, ...]
+    layers: tuple[Linear, ...]
+    pooling: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, observation: Num[Array, "..."]) -> Float[Array, " O"]:
+        features = Trunk(self.convolutions, self.layers[:-1], self.pooling)(observation)
+        return self.layers[-1](features)
 
 
 def init_q_network(
     config: NetworkConfig, observation_shape: tuple[int, ...], outputs: int, key: PRNGKeyArray
 ) -> QNetwork:
     """A network with Glorot-uniform weights and zero biases.
+
+    Raises `InvalidConfig` if convolutions are asked for where observations are no pictures.
+    """
+    convolutions, layers = build_layers(config, draw_weights(key, weight_shapes(config, observation_shape, outputs)))
+    return QNetwork(convolutions, layers, config.pooling)
+
+
+def weight_shapes(config: NetworkConfig, observation_shape: tuple[int, ...], outputs: int) -> list[tuple[int, ...]]:
+    """Shapes of a network's weights, from the picture to the values: [kernel, kernel, inputs, outputs] of each
+    convolution, then [inputs, outputs] of each layer.
 
     Raises `InvalidConfig` if convolutions are asked for where observations are no pictures.
     """
@@ -146,20 +175,25 @@ def init_q_network(
         height, width, inputs = shape
         weights.append((kernel, kernel, inputs, channels))
         shape = (-(-height // stride), -(-width // stride), channels)
-    weights += list(pairwise((math.prod(shape), *config.hidden, outputs)))
+    features = shape[-1] if config.pooling else math.prod(shape)
+    return weights + list(pairwise((features, *config.hidden, outputs)))
 
-    # One draw for all weights: every further random call would cost its own second of compilation.
-    sizes = [math.prod(weight) for weight in weights]
+
+def draw_weights(key: PRNGKeyArray, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
+    """Glorot-uniform weights, all from one draw: every further random call would cost its own second of compilation."""
+    sizes = [math.prod(shape) for shape in shapes]
     parts = jnp.split(jax.random.uniform(key, (sum(sizes),), minval=-1, maxval=1), list(accumulate(sizes))[:-1])
-    arrays = [_glorot_limit(weight) * part.reshape(weight) for weight, part in zip(weights, parts, strict=True)]
+    return [_glorot_limit(shape) * part.reshape(shape) for shape, part in zip(shapes, parts, strict=True)]
+
+
+def build_layers(config: NetworkConfig, weights: Sequence[Array]) -> tuple[tuple[Convolution, ...], tuple[Linear, ...]]:
+    """Convolutions and layers of these weights, in the order of `weight_shapes`, with zero biases."""
     deep = len(config.kernels)
-    return QNetwork(
-        convolutions=tuple(
-            Convolution(array, jnp.zeros(array.shape[-1]), stride)
-            for array, stride in zip(arrays[:deep], config.strides, strict=True)
-        ),
-        layers=tuple(Linear(array, jnp.zeros(array.shape[-1])) for array in arrays[deep:]),
+    convolutions = (
+        Convolution(weight, jnp.zeros(weight.shape[-1]), stride)
+        for weight, stride in zip(weights[:deep], config.strides, strict=True)
     )
+    return tuple(convolutions), tuple(Linear(weight, jnp.zeros(weight.shape[-1])) for weight in weights[deep:])
 
 
 def _glorot_limit(shape: tuple[int, ...]) -> float:
@@ -168,6 +202,6 @@ def _glorot_limit(shape: tuple[int, ...]) -> float:
     return math.sqrt(6 / (receptive * (shape[-2] + shape[-1])))
 
 
-def count_parameters(network: QNetwork) -> int:
+def count_parameters(network: PyTree) -> int:
     """How many numbers are learned."""
     return sum(leaf.size for leaf in jax.tree.leaves(network))

@@ -1,36 +1,37 @@
-"""A dense ring of transitions. Where the environment is functional it holds states; pictures are drawn at sampling."""
+"""A dense ring of experience. Where the environment is functional it holds states; pictures are drawn at sampling."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Int, PyTree, UInt32
 
-from lodestone.types import Transition
+Item = TypeVar("Item", bound=PyTree)
+"""What is remembered: a transition, or any other pytree of arrays."""
 
 
-class Replay(NamedTuple):
-    """The last `capacity` transitions."""
+class Replay(NamedTuple, Generic[Item]):
+    """The last `capacity` items."""
 
-    storage: Transition
+    storage: Item
     """Leaves have a leading axis of length `capacity`."""
     cursor: Int[Array, ""]
-    """Where the next transition goes."""
+    """Where the next item goes."""
     size: Int[Array, ""]
-    """How many transitions are held."""
+    """How many items are held."""
 
 
-def empty_replay(example: Transition, capacity: int) -> Replay:
-    """A replay for transitions of the shapes and dtypes of `example`."""
+def empty_replay(example: Item, capacity: int) -> Replay[Item]:
+    """A replay for items of the shapes and dtypes of `example`."""
     storage = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), example)
     return Replay(storage, jnp.int32(0), jnp.int32(0))
 
 
-def add(replay: Replay, batch: Transition, valid: Bool[Array, " M"]) -> Replay:
-    """Append the valid ones of M transitions (M at most the capacity), in order, overwriting the oldest."""
-    capacity = replay.storage.action.shape[0]
+def add(replay: Replay[Item], batch: Item, valid: Bool[Array, " M"]) -> Replay[Item]:
+    """Append the valid ones of M items (M at most the capacity), in order, overwriting the oldest."""
+    capacity = jax.tree.leaves(replay.storage)[0].shape[0]
     rank = jnp.cumsum(valid.astype(jnp.int32)) - 1
     slot = jnp.where(valid, (replay.cursor + rank) % capacity, capacity)  # out of range: dropped
     storage = jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), replay.storage, batch)
@@ -38,10 +39,10 @@ def add(replay: Replay, batch: Transition, valid: Bool[Array, " M"]) -> Replay:
     return Replay(storage, (replay.cursor + count) % capacity, jnp.minimum(replay.size + count, capacity))
 
 
-def sample(replay: Replay, bits: UInt32[Array, " B"]) -> Transition:
-    """B transitions drawn uniformly with replacement, by random bits. The replay must not be empty.
+def sample(replay: Replay[Item], bits: UInt32[Array, " B"]) -> Item:
+    """B items drawn uniformly with replacement, by random bits; empty ones while there are none.
 
-    The remainder favours no transition by more than one part in 2^32 / size.
+    The remainder favours no item by more than one part in 2^32 / size.
     """
-    index = (bits % replay.size.astype(jnp.uint32)).astype(jnp.int32)
+    index = (bits % jnp.maximum(replay.size, 1).astype(jnp.uint32)).astype(jnp.int32)
     return jax.tree.map(lambda leaf: leaf[index], replay.storage)

@@ -1,0 +1,530 @@
+"""Learning a united network: the policies of all options, their terminations and the policy over options at once.
+
+Kuzmin and Panov (2018, section 5) announce it: the lower layers of all networks are the same, so let them be shared.
+Three things are learned from experience of primitive steps:
+
+- *policies*: Q of the basic policy on the task itself and of every option on its own task. A task is another reward
+  and another end on the same dynamics, so every remembered step teaches all of them, off-policy;
+- *terminations*: whether each option has reached its end, classified against the end of the option's task;
+- the *manager*: Q over one step of the basic policy, or an option until its termination head stops it, by the
+  semi-Markov target. What it remembers counts as long as the head that acted would still begin with the same action:
+  as the heads learn, decisions that they would no longer take are of other options than those they are now.
+
+Which of these learn, and when, is a list of stages: one for all together (`JOINT`), or one after the other with the
+trunk frozen after the first (`SEQUENTIAL`), as the authors intended. What is shared is the network's `shared`: with
+"nothing", the same learner trains separate networks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import accumulate
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray, UInt32
+
+from lodestone.envs.base import Environment, example_state, initial_state, inverse_cdf, next_step
+from lodestone.envs.task import Task
+from lodestone.errors import InvalidConfig, check_name
+from lodestone.learning.adam import adam_step, start_adam
+from lodestone.learning.loop import Algorithm, RoundLog, log_round
+from lodestone.learning.networks import NetworkConfig
+from lodestone.learning.policies import greedy
+from lodestone.learning.replay import Replay, add, empty_replay, sample
+from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
+from lodestone.learning.targets import double_semi_markov_target, semi_markov_target
+from lodestone.learning.united_execution import Step, UnitedActor, explore, start_united_actor, tick
+from lodestone.learning.united_network import (
+    BASIC,
+    Shared,
+    UnitedNetwork,
+    each_head,
+    init_united_network,
+    one_head,
+)
+from lodestone.options.execution import Decision, Rules
+from lodestone.types import State, Transition
+
+Part = Literal["trunk", "basic policy", "option policies", "terminations", "manager"]
+PARTS: tuple[Part, ...] = get_args(Part)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of the run in which some parts of the network learn and the others stand still.
+
+    Where the manager learns, it acts, too; before, the basic policy alone acts on the task.
+    """
+
+    share: float
+    """Part of the run, from 0 to 1."""
+    learns: tuple[Part, ...]
+
+    def __post_init__(self) -> None:
+        for part in self.learns:
+            check_name("part of the network", part, PARTS)
+        if not (math.isfinite(self.share) and self.share > 0) or not self.learns:
+            raise InvalidConfig("A stage needs a positive share of the run, and at least one part that learns.")
+
+
+JOINT = (Stage(1.0, PARTS),)
+SEQUENTIAL = (
+    Stage(0.4, ("trunk", "basic policy")),
+    Stage(0.2, ("option policies",)),
+    Stage(0.05, ("terminations",)),
+    Stage(0.35, ("manager",)),
+)
+TRAINING = {"joint": JOINT, "sequential": SEQUENTIAL}
+
+
+@dataclass(frozen=True)
+class UnitedConfig:
+    """Settings of the learner. Lengths are in primitive steps of the environments that the manager acts in, unless they
+    say otherwise."""
+
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Shape of every head together with what lies below it."""
+    shared: Shared = "hidden"
+    """What the heads share; `nothing` makes every head a network of its own."""
+    training: Literal["joint", "sequential"] = "joint"
+    """All parts together, or one after the other."""
+    option_cap: int = 21
+    """Steps after which an option is stopped whatever its termination head says."""
+    double: bool = True
+    """Whether the online network picks what the target network values (double Q-learning)."""
+    learning_rate: Knots = ((0.0, 1e-3), (0.6, 1e-3), (1.0, 1e-5))
+    """Adam's step size over each stage."""
+    adam_epsilon: float = 1e-4
+    """Adam's constant under the fraction."""
+    max_gradient_norm: float = 1000.0
+    """Every weight and bias array's gradient is scaled down to this norm."""
+    policy_weight: float = 1.0
+    """Of the policies' loss: for every head the Huber loss, summed over the batch."""
+    termination_weight: float = 1.0
+    """Of the terminations' loss: for every head the cross-entropy, summed over the batch, both classes alike heavy."""
+    manager_weight: float = 1.0
+    """Of the manager's Huber loss, summed over its batch."""
+    trunk_gradient: float = 1.0
+    """Factor on what the heads' losses send into the shared layers."""
+    batch_size: int = 32
+    """Steps, and decisions, per update."""
+    huber_delta: float = 20.0
+    """Scaled error up to which the losses of values are quadratic, and beyond which they are linear."""
+    replay_capacity: int = 1_000_000
+    """Steps, and decisions, that are remembered; no more memory is taken than the run can fill."""
+    learning_starts: int = 4000
+    """Steps before the first update."""
+    target_period: int = 200
+    """Updates between two copies of the network to the target network."""
+    epsilon: Knots = ((0.05, 1.0), (0.15, 0.1))
+    """Over each stage, the probability of a random choice: one of the primitive actions and options, all alike."""
+    task_epsilon: Knots = ((0.0, 1.0), (0.4, 0.1))
+    """Over each stage, the probability of a random action where an option is trained on its own task."""
+    environments: int = 8
+    """Copies of the environment, per seed, that the manager acts in."""
+    task_environments: int = 4
+    """Copies of every option's own task, per seed, in which its policy alone acts."""
+    task_step_limit: int = 100
+    """Steps after which an episode of an option's own task is truncated."""
+    ticks_per_round: int = 2
+    """Steps of every environment between two rounds of updates."""
+    updates_per_round: int = 8
+    """Updates after each round."""
+    reward_scale: float = 0.2
+    """Factor on rewards inside the learner; values near 10 are learned fastest."""
+    decision_cost: float = 0.25
+    """Taken from the manager's reward, not from what is reported, once a decision: of equally good ways it then prefers
+    the one with fewer decisions."""
+
+    @property
+    def steps_per_round(self) -> int:
+        """Of the environments that the manager acts in."""
+        return self.ticks_per_round * self.environments
+
+    def rounds(self, steps: int) -> int:
+        """How many rounds take at least `steps` steps."""
+        return -(-steps // self.steps_per_round)
+
+    def __post_init__(self) -> None:
+        check_name("part to share", self.shared, get_args(Shared))
+        check_name("training", self.training, tuple(TRAINING))
+        check_knots("learning_rate", self.learning_rate, 0.0, 1.0)
+        check_knots("epsilon", self.epsilon, 0.0, 1.0)
+        check_knots("task_epsilon", self.task_epsilon, 0.0, 1.0)
+        for name in (
+            "option_cap",
+            "batch_size",
+            "replay_capacity",
+            "target_period",
+            "environments",
+            "task_environments",
+            "task_step_limit",
+            "ticks_per_round",
+            "updates_per_round",
+        ):
+            if getattr(self, name) < 1:
+                raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
+        for name in ("learning_starts", "policy_weight", "termination_weight", "manager_weight", "decision_cost"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise InvalidConfig(f"{name} is {getattr(self, name)}, but must not be negative.")
+        for name in ("adam_epsilon", "huber_delta", "max_gradient_norm", "reward_scale", "trunk_gradient"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be a positive number.")
+
+
+class Remembered(NamedTuple):
+    """One decision of the manager."""
+
+    transition: Transition
+    first_action: Int[Array, "*batch"]
+    """The primitive action that what was chosen began with."""
+
+
+class Learner(NamedTuple):
+    """What is learned, and from what."""
+
+    network: UnitedNetwork
+    target: UnitedNetwork
+    adam: optax.ScaleByAdamState
+    steps: Replay[Step]
+    decisions: Replay[Remembered]
+
+
+class TaskActor(NamedTuple):
+    """One environment of an option's own task."""
+
+    state: State
+    steps: Int[Array, ""]
+
+
+class Carry(NamedTuple):
+    """Everything that one seed carries from round to round."""
+
+    learner: Learner
+    actors: UnitedActor
+    task_actors: tuple[TaskActor, ...]
+    """For every option, its environments."""
+    key: PRNGKeyArray
+
+
+def task_tick(
+    task: Task,
+    step_limit: int,
+    values: Float[Array, " A"],
+    epsilon: Float[Array, ""],
+    uniform: Float[Array, " 4"],
+    actor: TaskActor,
+) -> tuple[TaskActor, Step]:
+    """One epsilon-greedy step on an option's own task, which begins anew by itself."""
+    every = jnp.ones(values.shape)
+    action = jnp.where(uniform[0] < epsilon, inverse_cdf(every, uniform[1]), greedy(values, every > 0))
+    moved = next_step(task, uniform[2], actor.state, action)
+    over = moved.terminated | (actor.steps + 1 >= step_limit)
+    restart = TaskActor(initial_state(task, uniform[3]), jnp.int32(0))
+    onward = TaskActor(moved.state, actor.steps + 1)
+    return _select(over, restart, onward), Step(actor.state, action, moved.state)
+
+
+def _select(condition: Bool[Array, ""], if_true: State, if_false: State) -> State:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
+
+
+def policy_loss(
+    config: UnitedConfig,
+    discount: float,
+    values: Float[Array, " A"],
+    next_values: Float[Array, " N"],
+    next_preferences: Float[Array, " N"],
+    action: Int[Array, ""],
+    reward: Float[Array, ""],
+    end: Bool[Array, ""],
+) -> Float[Array, ""]:
+    """One policy head's Huber loss for one step, by its own task's reward and end, against the best of N values of the
+    next state: its own, or those of the manager's choices."""
+    kept = jnp.where(end, 0.0, discount)
+    target = _target(config, reward * config.reward_scale, kept, next_values, next_preferences)
+    return optax.huber_loss(values[action], jax.lax.stop_gradient(target), delta=config.huber_delta)
+
+
+def _target(
+    config: UnitedConfig,
+    reward: Float[Array, ""],
+    discount: Float[Array, ""],
+    next_values: Float[Array, " N"],
+    next_preferences: Float[Array, " N"],
+    next_available: Bool[Array, " N"] | None = None,
+) -> Float[Array, ""]:
+    available = jnp.ones(next_values.shape, dtype=bool) if next_available is None else next_available
+    if config.double:
+        return double_semi_markov_target(reward, discount, next_values, next_preferences, available)
+    return semi_markov_target(reward, discount, next_values, available)
+
+
+def termination_loss(logits: Float[Array, "B n 2"], ended: Bool[Array, "B n"]) -> Float[Array, " n"]:
+    """Every termination head's cross-entropy, summed over the batch. Ends are rare: the two classes weigh alike."""
+    entropy = optax.softmax_cross_entropy_with_integer_labels(logits, ended.astype(jnp.int32))
+    size = ended.shape[0]
+    losses = []
+    for of_class in (ended, ~ended):
+        count = jnp.sum(of_class, axis=0, dtype=jnp.float32)
+        losses.append(jnp.sum(jnp.where(of_class, entropy, 0.0), axis=0) / jnp.maximum(count, 1))
+    return size / 2 * (losses[0] + losses[1])
+
+
+def manager_loss(
+    config: UnitedConfig,
+    values: Float[Array, " n+1"],
+    next_values: Float[Array, " n+1"],
+    next_preferences: Float[Array, " n+1"],
+    transition: Transition,
+) -> Float[Array, ""]:
+    """Huber loss of one decision against the semi-Markov target."""
+    reward = (transition.reward - config.decision_cost) * config.reward_scale
+    target = _target(config, reward, transition.discount, next_values, next_preferences, transition.next_available)
+    return optax.huber_loss(values[transition.action], jax.lax.stop_gradient(target), delta=config.huber_delta)
+
+
+def loss(
+    config: UnitedConfig,
+    stage: Stage,
+    environment: Environment,
+    options: Sequence[Task],
+    discount: float,
+    network: UnitedNetwork,
+    target: UnitedNetwork,
+    steps: Step,
+    decisions: Remembered,
+) -> Float[Array, ""]:
+    """Weighted sum of the losses of what learns in this stage, over B steps and B decisions."""
+    learns = stage.learns
+    observe = jax.vmap(environment.observe)
+    size = config.batch_size
+    learned = observe(_concatenate(steps.state, steps.next_state, decisions.transition.obs))
+    features = jax.vmap(network.features)(learned)
+    if network.trunk is not None:
+        factor = config.trunk_gradient if "trunk" in learns else 0.0
+        features = factor * features + (1 - factor) * jax.lax.stop_gradient(features)
+    at_state, at_next, at_decision = features[:size], features[size : 2 * size], features[2 * size :]
+    total = jnp.float32(0)
+
+    if "basic policy" in learns or "option policies" in learns:
+        seen_next = jax.vmap(target.features)(observe(steps.next_state))
+        held = jax.lax.stop_gradient(at_next)
+        values = jax.vmap(partial(each_head, network.policies))(at_state)
+        next_values = jax.vmap(partial(each_head, target.policies))(seen_next)
+        preferences = jax.vmap(partial(each_head, network.policies))(held)
+        for head, task in enumerate((environment, *options)):
+            if ("basic policy" if head == BASIC else "option policies") not in learns:
+                continue
+            rewards = jax.vmap(task.reward)(steps.state, steps.action, steps.next_state)
+            ends = jax.vmap(task.terminal)(steps.next_state)
+            after, preferred = next_values[:, head], preferences[:, head]
+            if head == BASIC and "manager" in learns:  # after one step of the basic policy the manager chooses
+                after, preferred = jax.vmap(target.manager)(seen_next), jax.vmap(network.manager)(held)
+            of_head = jax.vmap(partial(policy_loss, config, discount))
+            losses = of_head(values[:, head], after, preferred, steps.action, rewards, ends)
+            total += config.policy_weight * jnp.sum(losses)
+    if "terminations" in learns and options:
+        logits = jax.vmap(partial(each_head, network.terminations))(at_next)
+        ended = _each(options, lambda task: jax.vmap(task.terminal)(steps.next_state))
+        total += config.termination_weight * jnp.sum(termination_loss(logits, ended))
+    if "manager" in learns:
+        transition = decisions.transition
+        next_seen = observe(transition.next_obs)
+        values = jax.vmap(network.manager)(at_decision)
+        next_values = jax.vmap(lambda seen: target.manager(target.features(seen)))(next_seen)
+        preferences = jax.vmap(lambda seen: network.manager(network.features(seen)))(next_seen)
+        losses = jax.vmap(partial(manager_loss, config))(values, next_values, preferences, transition)
+        actions = jax.vmap(partial(each_head, network.policies))(jax.lax.stop_gradient(at_decision))
+        would_do = jnp.argmax(jnp.take_along_axis(actions, transition.action[:, None, None], axis=1)[:, 0], axis=-1)
+        total += config.manager_weight * jnp.sum(jnp.where(would_do == decisions.first_action, losses, 0.0))
+    return total
+
+
+def _each(tasks: Sequence[Environment], ask: Callable[[Environment], Array]) -> Num[Array, "B n"]:
+    return jnp.stack([ask(task) for task in tasks], axis=1)
+
+
+def _concatenate(*states: State) -> State:
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
+
+
+def update(
+    config: UnitedConfig,
+    stage: Stage,
+    environment: Environment,
+    options: Sequence[Task],
+    discount: float,
+    learner: Learner,
+    bits: UInt32[Array, "2 B"],
+    learning_rate: Float[Array, ""],
+) -> tuple[Learner, Float[Array, ""]]:
+    """One gradient step on a batch of steps and one of decisions, drawn by random bits; the target network stays.
+
+    Returns the loss per item of a batch, too.
+    """
+    steps, decisions = sample(learner.steps, bits[0]), sample(learner.decisions, bits[1])
+    value, gradient = jax.value_and_grad(partial(loss, config, stage, environment, options, discount))(
+        learner.network, learner.target, steps, decisions
+    )
+    network, adam = adam_step(
+        learner.network, gradient, learner.adam, learning_rate, config.adam_epsilon, config.max_gradient_norm
+    )
+    return learner._replace(network=network, adam=adam), value / config.batch_size
+
+
+def united(
+    config: UnitedConfig,
+    environment: Environment,
+    options: Sequence[Task],
+    rules: Rules,
+    steps: int,
+    stages: tuple[Stage, ...] | None = None,
+) -> Algorithm:
+    """The algorithm for the training loop: options are given by their tasks, which are learned too.
+
+    `steps`, the run's length, is what schedules and stages are fractions of; it bounds the replays' memory, too.
+    `stages` replaces what `config.training` says.
+    """
+    stages = stages or TRAINING[config.training]
+    rounds = config.rounds(steps)
+    in_all = sum(stage.share for stage in stages)
+    ends = [round(rounds * total / in_all) for total in accumulate(stage.share for stage in stages)]
+    starts = [0, *ends[:-1]]
+    seen_per_round = config.ticks_per_round * (config.environments + len(options) * config.task_environments)
+    learning_starts = config.rounds(config.learning_starts)
+
+    def init(key: PRNGKeyArray) -> Carry:
+        network_key, actor_key, key = jax.random.split(key, 3)
+        state = example_state(environment)
+        shape = jax.eval_shape(environment.observe, state).shape
+        network = init_united_network(
+            config.network, config.shared, shape, environment.num_actions, len(options), network_key
+        )
+        real, whole = jnp.float32(0), jnp.int32(0)
+        everything = jnp.zeros(len(options) + 1, dtype=bool)
+        transition = Transition(state, whole, real, real, state, everything)
+        learner = Learner(
+            network=network,
+            target=network,
+            adam=start_adam(network),
+            steps=empty_replay(Step(state, whole, state), _capacity(config.replay_capacity, seen_per_round, rounds)),
+            decisions=empty_replay(
+                Remembered(transition, whole), _capacity(config.replay_capacity, config.steps_per_round, rounds)
+            ),
+        )
+        keys = jax.random.split(actor_key, (len(options) + 1, max(config.environments, config.task_environments)))
+        return Carry(
+            learner=learner,
+            actors=jax.vmap(partial(start_united_actor, environment))(keys[0, : config.environments]),
+            task_actors=tuple(
+                jax.vmap(partial(_start_task, option))(keys[position, : config.task_environments])
+                for position, option in enumerate(options, start=1)
+            ),
+            key=key,
+        )
+
+    def collect(
+        stage: Stage, key: PRNGKeyArray, carry: Carry, epsilon: Float[Array, ""], task_epsilon: Float[Array, ""]
+    ) -> tuple[Carry, Decision]:
+        """The round's ticks. Returns the manager's decisions, in order of time, too."""
+        network = carry.learner.network
+
+        def act(actors: tuple, tick_key: PRNGKeyArray) -> tuple[tuple, tuple]:
+            united_actors, task_actors = actors
+            uniform = jax.random.uniform(tick_key, (config.environments + len(options) * config.task_environments, 4))
+            of_manager = uniform[: config.environments]
+            outputs = jax.vmap(lambda state: network(environment.observe(state)))(united_actors.actor.state)
+            decisions = jax.vmap(explore, in_axes=(0, 0, None, None))(
+                outputs, of_manager[:, :2], epsilon, "manager" in stage.learns
+            )
+            united_actors, ticks = jax.vmap(partial(tick, environment, rules, config.option_cap))(
+                outputs, decisions, of_manager[:, 2:], united_actors
+            )
+            stepped, next_task_actors = [ticks.step], []
+            of_tasks = uniform[config.environments :].reshape(len(options), config.task_environments, 4)
+            for position, (option, actor) in enumerate(zip(options, task_actors, strict=True)):
+                head = one_head(network.policies, BASIC + 1 + position)
+                values = jax.vmap(lambda state, head=head: head(network.features(environment.observe(state))))(
+                    actor.state
+                )
+                actor, step = jax.vmap(partial(task_tick, option, config.task_step_limit), in_axes=(0, None, 0, 0))(
+                    values, task_epsilon, of_tasks[position], actor
+                )
+                next_task_actors.append(actor)
+                stepped.append(step)
+            return (united_actors, tuple(next_task_actors)), (ticks, _concatenate(*stepped))
+
+        keys = jax.random.split(key, config.ticks_per_round)
+        (actors, task_actors), (ticks, stepped) = jax.lax.scan(act, (carry.actors, carry.task_actors), keys)
+        acted = jnp.ones(stepped.action.shape, dtype=bool).at[:, : config.environments].set(ticks.acted)
+        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (ticks, stepped, acted))
+        ticks, stepped, acted = flat
+        learner = carry.learner._replace(
+            steps=add(carry.learner.steps, stepped, acted),
+            decisions=add(
+                carry.learner.decisions,
+                Remembered(ticks.decision.transition, ticks.first_action),
+                ticks.decision.valid,
+            ),
+        )
+        return carry._replace(learner=learner, actors=actors, task_actors=task_actors), ticks.decision
+
+    def run_stage(index: int, carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
+        stage, start, end = stages[index], starts[index], ends[index]
+        collect_key, update_key, key = jax.random.split(carry.key, 3)
+        fraction = (number - start).astype(jnp.float32) / max(1, end - start)
+        learning_rate = piecewise_linear(config.learning_rate, fraction)
+        carry, decisions = collect(
+            stage,
+            collect_key,
+            carry._replace(key=key),
+            piecewise_linear(config.epsilon, fraction),
+            piecewise_linear(config.task_epsilon, fraction),
+        )
+        learner = carry.learner
+
+        # These numbers are the same for all seeds, so that under vmap the branches below stay branches.
+        updates = jnp.where(number >= learning_starts, config.updates_per_round, 0)
+        updates_before = (number - learning_starts) * config.updates_per_round
+        fresh = jax.lax.cond(number == start, lambda: start_adam(learner.network), lambda: learner.adam)
+        bits = jax.random.bits(update_key, (config.updates_per_round, 2, config.batch_size))
+
+        def learn(count: Int[Array, ""], state: tuple) -> tuple:
+            network, target, adam, total = state
+            current = learner._replace(network=network, target=target, adam=adam)
+            current, value = update(
+                config, stage, environment, options, rules.discount, current, bits[count], learning_rate
+            )
+            due = (updates_before + count + 1) % config.target_period == 0
+            target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
+            return current.network, target, current.adam, total + value
+
+        state = (learner.network, learner.target, fresh, jnp.float32(0))
+        network, target, adam, total = jax.lax.fori_loop(0, updates, learn, state)
+        log = log_round(decisions, total / jnp.maximum(updates, 1).astype(jnp.float32))
+        learner = learner._replace(network=network, target=target, adam=adam)
+        return carry._replace(learner=learner), log
+
+    def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
+        if len(stages) == 1:
+            return run_stage(0, carry, number)
+        stage = jnp.sum(number >= jnp.asarray(ends[:-1]))
+        return jax.lax.switch(stage, [partial(run_stage, index) for index in range(len(stages))], carry, number)
+
+    return Algorithm(init, run_round)
+
+
+def _capacity(most: int, per_round: int, rounds: int) -> int:
+    """Never less than a round brings, never more than the run does."""
+    return max(per_round, min(most, per_round * rounds))
+
+
+def _start_task(task: Task, key: PRNGKeyArray) -> TaskActor:
+    return TaskActor(initial_state(task, jax.random.uniform(key)), jnp.int32(0))
