@@ -129,6 +129,7 @@ def make_playback() -> Playback:
         action=np.array(action),
         values=values,
         available=available,
+        termination=np.where(np.arange(len(OPTIONS)) < len(ACTIONS), 1.0, rng.random((steps, len(OPTIONS)))),
         total_reward=total_reward,
     )
 

@@ -242,6 +242,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("maxq", ["two-rooms"], "30000"),
         ("hamq", ["magnet-arm", *TINY], "20000"),
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
+        ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
     ],
 )
 def test_hierarchies_are_trained_saved_and_watched(agent, environment, steps, capsys, tmp_path):
@@ -287,6 +288,9 @@ REFUSED = [
     (["train", "maxq", "magnet-arm", "--out", "run"], "no ready-made task graph for magnet-arm"),
     (["train", "hamq", "chain", "--out", "run"], "no ready-made machines for chain"),
     (["train", "hamq", "magnet-arm", "--options", "lift"], "takes no options"),
+    (["train", "united", "magnet-arm", "--options", "lift"], "takes no options"),
+    (["train", "united", "taxi"], "this environment has none"),
+    (["train", "united", "magnet-arm", "--option-cap", "5"], "option_cap is given, but no options are"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),
     (["train", "dqn", "magnet-arm", "--seeds", "0"], "seeds is 0"),
     (["train", "dqn", "magnet-arm", "--no-primitives"], "at least one option"),

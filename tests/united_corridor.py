@@ -8,7 +8,7 @@ from corridor import Corridor
 from lodestone.envs.task import Task
 
 LENGTH = 7
-CORRIDOR = Corridor(length=LENGTH, step_reward=-1.0)
+CORRIDOR = Corridor(length=LENGTH, step_reward=-7.0)
 
 
 def _anywhere(corridor):

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
-from lodestone.agents.saved import MachinePolicy, Policy
+from lodestone.agents.saved import AnyPolicy, MachinePolicy, UnitedPolicy
 from lodestone.envs.base import Environment
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
+from lodestone.learning.united_execution import play_united, trace_united
 
 MAX_STEPS = 5000
 """Primitive steps after which an episode is given up where the policy's rules have no limit that ends it sooner."""
@@ -40,16 +41,19 @@ class Playback:
     values: Float[np.ndarray, "T O"]
     """Q(s, .) in units of the environment's reward."""
     available: Bool[np.ndarray, "T O"]
+    termination: Float[np.ndarray, "T O"]
+    """Probability that each option, had it run until the state before the step, would stop there; not a number where an
+    option has none."""
     total_reward: Float[np.ndarray, " T"]
     """Return so far, after each step."""
 
 
-def play(policy: Policy | MachinePolicy, key: PRNGKeyArray) -> Episode:
+def play(policy: AnyPolicy, key: PRNGKeyArray) -> Episode:
     """One greedy episode of every seed, all with the same key; leaves have a leading seed axis."""
     return jax.tree.map(lambda leaf: leaf[:, 0], play_many(policy, key, 1))
 
 
-def play_many(policy: Policy | MachinePolicy, key: PRNGKeyArray, episodes: int) -> Episode:
+def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     """So many greedy episodes of every seed, all seeds with the same keys; leaves have axes for seed and episode."""
     keys = key[None] if episodes == 1 else jax.random.split(key, episodes)
     if isinstance(policy, MachinePolicy):
@@ -57,15 +61,17 @@ def play_many(policy: Policy | MachinePolicy, key: PRNGKeyArray, episodes: int) 
         played = [_of_machines(policy, position, each) for position in range(seeds) for each in keys]
         return jax.tree.map(lambda *leaves: np.array(leaves).reshape(seeds, episodes), *played)
 
+    def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
+        if isinstance(policy, UnitedPolicy):
+            return play_united(policy.environment, policy.rules, policy.option_cap, learned, key, MAX_STEPS)
+        values = policy.values_of(learned)
+        return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
+
     @jax.jit
     def run(learned: PyTree) -> Episode:
-        def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
-            values = policy.values_of(learned)
-            return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
-
         return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(learned, keys)
 
-    return jax.tree.map(np.asarray, run(policy.learned))
+    return jax.tree.map(np.asarray, run(policy.networks if isinstance(policy, UnitedPolicy) else policy.learned))
 
 
 def episodes_to_judge(environment: Environment) -> int:
@@ -88,17 +94,19 @@ def _play_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> J
     return play_choices(policy.process, edges, rng, max_steps, policy.rules.decision_limit)
 
 
-def record(policy: Policy | MachinePolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
+def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
     """One greedy episode of the seed at this position, with its pictures. Of machines the options are the edges of
     their choices: an edge runs until the next choice."""
     if isinstance(policy, MachinePolicy):
         return _record_machines(policy, position, key, agent)
-    values = policy.values(position)
     length = int(play(policy, key).steps[position])
 
     @jax.jit
     def run(key: PRNGKeyArray) -> Trace:
-        return trace_episode(policy.environment, policy.options, policy.rules, values, key, length)
+        environment, rules = policy.environment, policy.rules
+        if isinstance(policy, UnitedPolicy):
+            return trace_united(environment, rules, policy.option_cap, policy.network(position), key, length)
+        return trace_episode(environment, policy.options, rules, policy.values(position), key, length)
 
     trace = jax.tree.map(np.asarray, run(key))
     states = [jax.tree.map(lambda leaf, step=step: leaf[step], trace.state) for step in range(length)]
@@ -106,14 +114,15 @@ def record(policy: Policy | MachinePolicy, position: int, key: PRNGKeyArray, age
     return Playback(
         agent=agent,
         seed=policy.seeds[position],
-        option_names=policy.options.names,
+        option_names=policy.choices if isinstance(policy, UnitedPolicy) else policy.options.names,
         action_names=policy.environment.action_names,
         pictures=np.stack([policy.environment.render(state) for state in states]),
         option=trace.option,
         chosen=trace.chosen,
         action=trace.action,
-        values=trace.values,
+        values=trace.values / policy.reward_scale if isinstance(policy, UnitedPolicy) else trace.values,
         available=trace.available,
+        termination=trace.termination,
         total_reward=np.cumsum(trace.reward),
     )
 
@@ -152,5 +161,6 @@ def _record_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray, ag
         action=np.array(action),
         values=np.stack(values),
         available=np.stack(available),
+        termination=np.full((len(option), len(names)), np.nan),
         total_reward=np.cumsum(episode.reward[episode.edge < 0]),
     )

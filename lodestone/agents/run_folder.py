@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lodestone import __version__
-from lodestone.agents.saved import MachinePolicy, Policy, save_policy
+from lodestone.agents.saved import AnyPolicy, save_policy
 from lodestone.errors import CannotWrite
 from lodestone.files import prepare_folder, write_json
 from lodestone.learning.history import History
@@ -49,7 +49,7 @@ class RunFolder:
             self._metrics.write(json.dumps(line) + "\n")
         self._metrics.flush()
 
-    def finish(self, policy: Policy | MachinePolicy) -> None:
+    def finish(self, policy: AnyPolicy) -> None:
         """Save what was learned."""
         self._metrics.close()
         save_policy(self.path / POLICY, policy)

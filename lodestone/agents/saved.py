@@ -19,13 +19,16 @@ from lodestone import __version__
 from lodestone.envs.base import Environment, example_state
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
+from lodestone.envs.task import Task
 from lodestone.errors import BadFile, InvalidConfig, LodestoneError
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
+from lodestone.learning.united_execution import UnitedOptions, choices
+from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
 from lodestone.machines.catalogue import machines
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Capped, Options, Primitives, Union
-from lodestone.options.catalogue import scripted_options, task_named
+from lodestone.options.catalogue import scripted_options, task_named, tasks
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.options.scripted import Scripted
@@ -84,10 +87,50 @@ class MachinePolicy:
         return joint_process(self.environment, self.hierarchy)
 
 
-def save_policy(path: Path, policy: Policy | MachinePolicy) -> None:
+@dataclass(frozen=True)
+class UnitedPolicy:
+    """A trained united network, of one or more seeds."""
+
+    agent: str
+    """Name of the algorithm."""
+    environment: Environment
+    tasks: tuple[Task, ...]
+    """What the options are for, in order."""
+    option_cap: int
+    """Steps after which an option is stopped."""
+    rules: Rules
+    shape: NetworkConfig
+    shared: Shared
+    networks: UnitedNetwork
+    """With a leading seed axis."""
+    reward_scale: float
+    """Factor by which the learned values are larger than the environment's rewards."""
+    seeds: tuple[int, ...]
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Names of what the manager chooses from."""
+        return choices(self.tasks)
+
+    def network(self, position: int) -> UnitedNetwork:
+        """Of the seed at this position."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.networks)
+
+    def options(self, position: int) -> UnitedOptions:
+        """What that seed's manager chooses from, as a set of options."""
+        return UnitedOptions(self.environment, self.network(position), self.choices, self.option_cap)
+
+
+AnyPolicy = Policy | MachinePolicy | UnitedPolicy
+
+
+def save_policy(path: Path, policy: AnyPolicy) -> None:
     """Write one file. Raises `CannotWrite`."""
     if isinstance(policy, MachinePolicy):
         _save_machine_policy(path, policy)
+        return
+    if isinstance(policy, UnitedPolicy):
+        _save_united_policy(path, policy)
         return
     recipe, arrays = _describe_options(policy.options, "options")
     network = _describe_network(policy.learned) if isinstance(policy.learned, QNetwork) else None
@@ -120,14 +163,37 @@ def _save_machine_policy(path: Path, policy: MachinePolicy) -> None:
     write_arrays(path, {"tables": np.asarray(policy.tables)}, header)
 
 
-def load_policy(path: Path) -> Policy | MachinePolicy:
+def _save_united_policy(path: Path, policy: UnitedPolicy) -> None:
+    if not set(policy.tasks) <= set(tasks(policy.environment)):
+        raise InvalidConfig("Only united networks for an environment's ready-made tasks can be saved.")
+    header = {
+        "kind": "policy",
+        "version": __version__,
+        "agent": policy.agent,
+        "environment": describe_environment(policy.environment),
+        "united": {
+            "tasks": [task.name for task in policy.tasks],
+            "option_cap": policy.option_cap,
+            "shape": asdict(policy.shape),
+            "shared": policy.shared,
+        },
+        "rules": asdict(policy.rules),
+        "reward_scale": policy.reward_scale,
+        "seeds": list(policy.seeds),
+    }
+    write_arrays(path, _named_arrays(policy.networks, "learned"), header)
+
+
+def load_policy(path: Path) -> AnyPolicy:
     """Raises `BadFile`."""
     arrays, header = _read(path, "policy")
 
-    def build() -> Policy | MachinePolicy:
+    def build() -> AnyPolicy:
         environment = make_environment(header["environment"]["name"], **header["environment"]["parameters"])
         if "machines" in header:
             return _build_machine_policy(environment, header, arrays)
+        if "united" in header:
+            return _build_united_policy(environment, header, arrays)
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
@@ -151,6 +217,30 @@ def _build_machine_policy(environment: Environment, header: Recipe, arrays: Arra
     if not np.array_equal(np.isneginf(tables), np.broadcast_to(~process.available, tables.shape)):
         raise BadFile("its values are of other machines.")
     return MachinePolicy(str(header["agent"]), environment, hierarchy, Rules(**header["rules"]), tables, seeds)
+
+
+def _build_united_policy(environment: Environment, header: Recipe, arrays: Arrays) -> UnitedPolicy:
+    recipe, seeds = header["united"], tuple(int(seed) for seed in header["seeds"])
+    for_options = tuple(task_named(environment, name) for name in recipe["tasks"])
+    shape, shared, cap = _build_shape(recipe["shape"]), recipe["shared"], int(recipe["option_cap"])
+    seen = jax.eval_shape(environment.observe, example_state(environment)).shape
+    actions, options = environment.num_actions, len(for_options)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), len(seeds)))
+    template = jax.eval_shape(
+        jax.vmap(lambda key: init_united_network(shape, shared, seen, actions, options, key)), keys
+    )
+    return UnitedPolicy(
+        agent=str(header["agent"]),
+        environment=environment,
+        tasks=for_options,
+        option_cap=cap,
+        rules=Rules(**header["rules"]),
+        shape=shape,
+        shared=shared,
+        networks=_fill(template, arrays, "learned"),
+        reward_scale=float(header["reward_scale"]),
+        seeds=seeds,
+    )
 
 
 def save_options(path: Path, options: Options, environment: Environment) -> None:
@@ -259,6 +349,11 @@ def _describe_network(network: QNetwork) -> Recipe:
             pooling=network.pooling,
         )
     )
+
+
+def _build_shape(recipe: Recipe) -> NetworkConfig:
+    widths = {name: tuple(int(number) for number in recipe[name]) for name in WIDTHS}
+    return NetworkConfig(**widths, pooling=bool(recipe["pooling"]))
 
 
 WIDTHS = ("kernels", "strides", "channels", "hidden")

@@ -16,25 +16,30 @@ from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.saved import MachinePolicy, Policy
+from lodestone.agents.saved import AnyPolicy, MachinePolicy, Policy, UnitedPolicy
+from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment
+from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig
 from lodestone.learning.history import History
 from lodestone.learning.loop import Algorithm, train
+from lodestone.learning.united_execution import choices
 from lodestone.machines.catalogue import machines
 from lodestone.machines.configurations import configurations
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Options
+from lodestone.options.catalogue import tasks as ready_made_tasks
 from lodestone.options.execution import Rules
 from lodestone.planning.joint import joint_process
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.task_graph import TaskGraph, tabulate_tasks
 
-AgentConfig = DQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
+AgentConfig = DQNConfig | UnitedConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
 
 AGENTS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
+    "united": UnitedConfig,
     "q-learning": QLearningConfig,
     "intra-option": IntraOptionConfig,
     "maxq": MAXQConfig,
@@ -57,11 +62,13 @@ def train_policy(
     *,
     hierarchy: Hierarchy | None = None,
     graph: TaskGraph | None = None,
-) -> tuple[Policy | MachinePolicy, History]:
-    """Train all seeds at once for `length` decisions each (tabular agents: primitive steps).
+    tasks: Sequence[Task] | None = None,
+) -> tuple[AnyPolicy, History]:
+    """Train all seeds at once for `length` decisions each (tabular agents and united networks: primitive steps).
 
-    HAMQ learns in `hierarchy` and MAXQ in `graph` (default: what the environment has ready-made); their options must be
-    the primitive actions. What MAXQ leaves is the policy that asks anew from the root down at every step.
+    HAMQ learns in `hierarchy`, MAXQ in `graph`, and a united network the options that `tasks` are for (default: what
+    the environment has ready-made); their `options` must be the primitive actions. What MAXQ leaves is the policy that
+    asks anew from the root down at every step.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
@@ -69,7 +76,9 @@ def train_policy(
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
     if isinstance(config, HAMQConfig):
         hierarchy = hierarchy or machines(environment)
-    plan = _plan(config, environment, options, rules, length, hierarchy, graph)
+    if isinstance(config, UnitedConfig):
+        tasks = tuple(ready_made_tasks(environment) if tasks is None else tasks)
+    plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks)
     history = History(len(seeds), plan.choices)
     for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS)):
         history.add(chunk)
@@ -81,6 +90,23 @@ def train_policy(
     if isinstance(config, HAMQConfig):
         assert hierarchy is not None
         return MachinePolicy(name, environment, hierarchy, rules, learned, tuple(seeds)), history
+    if isinstance(config, UnitedConfig):
+        assert tasks is not None
+        return (
+            UnitedPolicy(
+                agent=name,
+                environment=environment,
+                tasks=tuple(tasks),
+                option_cap=config.max_option_steps,
+                rules=rules,
+                shape=config.network,
+                shared=config.shared,
+                networks=learned,
+                reward_scale=config.reward_scale,
+                seeds=tuple(seeds),
+            ),
+            history,
+        )
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
@@ -112,6 +138,7 @@ def _plan(
     length: int,
     hierarchy: Hierarchy | None = None,
     graph: TaskGraph | None = None,
+    tasks: Sequence[Task] | None = None,
 ) -> _Plan:
     match config:
         case DQNConfig():
@@ -121,6 +148,17 @@ def _plan(
                 of_carry=lambda carry: carry.learner.network,
                 choices=options.names,
                 reward_scale=config.reward_scale,
+            )
+        case UnitedConfig():
+            _refuse_options("A united network", options, environment)
+            tasks = ready_made_tasks(environment) if tasks is None else tasks
+            if not tasks:
+                raise InvalidConfig("A united network learns options by their tasks, and this environment has none.")
+            return _Plan(
+                algorithm=united(config, environment, tasks, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.learner.network,
+                choices=choices(tasks),
             )
         case QLearningConfig():
             return _tables(q_learning(config, environment, options, rules, length), options, length)
@@ -141,12 +179,12 @@ def _plan(
         case MAXQConfig():
             _refuse_options("MAXQ", options, environment)
             graph = graph or task_graph(environment)
-            tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
+            tables = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
             return _Plan(
                 algorithm=maxq(config, environment, graph, rules, length),
                 rounds=rounds_for(graph, length),
                 of_carry=lambda carry: carry.learned,
-                choices=tasks.edge_names,
+                choices=tables.edge_names,
                 learned=lambda learned: jnp.asarray(polled_values(config, environment, graph, learned)),
                 ends_by_steps=True,
             )
@@ -154,7 +192,7 @@ def _plan(
 
 def _refuse_options(agent: str, options: Options, environment: Environment) -> None:
     if options.names != environment.action_names:
-        raise InvalidConfig(f"{agent} chooses as its hierarchy says: it takes no options.")
+        raise InvalidConfig(f"{agent} brings its own choices: it takes no options.")
 
 
 def _tables(algorithm: Algorithm, options: Options, steps: int) -> _Plan:

@@ -94,7 +94,7 @@ class UnitedConfig:
     """What the heads share; `nothing` makes every head a network of its own."""
     training: Literal["joint", "sequential"] = "joint"
     """All parts together, or one after the other."""
-    option_cap: int = 21
+    max_option_steps: int = 21
     """Steps after which an option is stopped whatever its termination head says."""
     double: bool = True
     """Whether the online network picks what the target network values (double Q-learning)."""
@@ -158,7 +158,7 @@ class UnitedConfig:
         check_knots("epsilon", self.epsilon, 0.0, 1.0)
         check_knots("task_epsilon", self.task_epsilon, 0.0, 1.0)
         for name in (
-            "option_cap",
+            "max_option_steps",
             "batch_size",
             "replay_capacity",
             "target_period",
@@ -444,7 +444,7 @@ def united(
             decisions = jax.vmap(explore, in_axes=(0, 0, None, None))(
                 outputs, of_manager[:, :2], epsilon, "manager" in stage.learns
             )
-            united_actors, ticks = jax.vmap(partial(tick, environment, rules, config.option_cap))(
+            united_actors, ticks = jax.vmap(partial(tick, environment, rules, config.max_option_steps))(
                 outputs, decisions, of_manager[:, 2:], united_actors
             )
             stepped, next_task_actors = [ticks.step], []

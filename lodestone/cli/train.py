@@ -166,6 +166,8 @@ def _train(train: Train, agent: str) -> None:
 def _choose_options(train: Train) -> Options:
     """What the agent chooses from. Raises `NoOptionAvailable` where a reachable state has nothing."""
     environment = train.environment
+    if train.option_cap is not None and not train.options:
+        raise InvalidConfig("option_cap is given, but no options are.")
     parts: list[Options] = [Primitives(environment.action_names)] if train.primitives else []
     if train.options:
         first = Path(train.options[0])

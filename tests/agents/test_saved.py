@@ -8,13 +8,15 @@ import jax
 import numpy as np
 import pytest
 
-from lodestone.agents.saved import Policy, load_options, load_policy, save_options, save_policy
+from lodestone.agents.saved import Policy, UnitedPolicy, load_options, load_policy, save_options, save_policy
 from lodestone.envs.base import example_state
-from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.magnet_arm import MagnetArm, arm_is_down, go_down_task, random_layouts
 from lodestone.envs.state_space import reachable_states
-from lodestone.errors import BadFile
+from lodestone.envs.task import Task
+from lodestone.errors import BadFile, InvalidConfig
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.networks import NetworkConfig, init_q_network
+from lodestone.learning.united_network import init_united_network
 from lodestone.options.base import Capped, Primitives, Union
 from lodestone.options.catalogue import scripted_options, tasks
 from lodestone.options.execution import Rules
@@ -62,6 +64,33 @@ def test_a_table_comes_back(tmp_path):
     save_policy(tmp_path / "policy.safetensors", policy)
     found = load_policy(tmp_path / "policy.safetensors")
     np.testing.assert_array_equal(found.values(1)(example_state(ARM)), table[1, 0])
+
+
+def united_policy(for_options) -> UnitedPolicy:
+    shape = NetworkConfig(kernels=(3,), strides=(3,), channels=(4,), hidden=(8,))
+    keys = jax.random.split(jax.random.key(0), 2)
+    networks = jax.vmap(lambda key: init_united_network(shape, "hidden", (12, 9, 3), 6, len(for_options), key))(keys)
+    rules = Rules(decision_limit=50)
+    return UnitedPolicy("united", ARM, for_options, 5, rules, shape, "hidden", networks, 0.1, (4, 5))
+
+
+def test_a_united_network_comes_back(tmp_path):
+    policy = united_policy(tasks(ARM))
+    save_policy(tmp_path / "policy.safetensors", policy)
+    found = load_policy(tmp_path / "policy.safetensors")
+    for name in ("agent", "environment", "tasks", "option_cap", "rules", "shape", "shared", "reward_scale", "seeds"):
+        assert getattr(found, name) == getattr(policy, name)
+    state = reachable_states(ARM).state(17)
+    for a, b in zip(found.network(1)(ARM.observe(state)), policy.network(1)(ARM.observe(state)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert found.options(1).names == ("basic policy", "go-down", "lift")
+    assert found.options(1).max_steps == (1, 5, 5)
+
+
+def test_a_united_network_for_tasks_of_ones_own_is_not_saved(tmp_path):
+    own = Task(ARM, "own", random_layouts, arm_is_down, go_down_task(ARM).pay)
+    with pytest.raises(InvalidConfig, match="ready-made tasks"):
+        save_policy(tmp_path / "policy.safetensors", united_policy((own,)))
 
 
 def test_values_are_in_units_of_the_environments_reward(policy):

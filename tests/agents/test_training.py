@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from united_corridor import CORRIDOR, OPTIONS
 
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.playing import play, play_many, record
-from lodestone.agents.saved import MachinePolicy, save_policy
+from lodestone.agents.saved import MachinePolicy, UnitedPolicy, save_policy
 from lodestone.agents.training import train_policy
+from lodestone.agents.united import UnitedConfig
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import InvalidConfig
+from lodestone.learning.networks import NetworkConfig
 from lodestone.machines.machine import every_action
 from lodestone.options.base import Primitives
 from lodestone.options.execution import Rules
@@ -65,3 +69,27 @@ def test_hierarchies_take_no_options_and_need_a_program():
         train_policy(HAMQConfig(), rooms, Primitives(rooms.action_names), Rules(step_limit=9), 100, [0])
     with pytest.raises(InvalidConfig, match="takes no options"):
         train_policy(MAXQConfig(), rooms, Primitives(("a", "b")), Rules(step_limit=9), 100, [0])
+
+
+def test_a_united_network_is_trained_for_tasks_of_ones_own():
+    config = UnitedConfig(
+        network=NetworkConfig(kernels=(), strides=(), channels=(), hidden=(32,)), learning_starts=100, environments=4
+    )
+    primitives, rules = Primitives(CORRIDOR.action_names), Rules(discount=0.5, step_limit=50)
+    policy, history = train_policy(config, CORRIDOR, primitives, rules, 4000, [0, 1], tasks=OPTIONS)
+    assert isinstance(policy, UnitedPolicy)
+    assert history.choices == policy.choices == ("basic policy", "to-2", "to-4")
+    assert play(policy, jax.random.key(0)).success.all()
+    playback = record(policy, 1, jax.random.key(0), "united")
+    assert playback.option_names == policy.choices
+    ended = playback.termination[:, 1:] > 0.5
+    cells = np.arange(len(ended))  # it walks straight to the end
+    np.testing.assert_array_equal(ended, np.stack([cells == 2, cells == 4], axis=1))
+    values = policy.network(1)(CORRIDOR.observe(jnp.int32(0))).choices / config.reward_scale
+    np.testing.assert_allclose(playback.values[0], values, rtol=1e-5)
+
+
+def test_a_united_network_needs_tasks():
+    rooms = TwoRooms()
+    with pytest.raises(InvalidConfig, match="environment has none"):
+        train_policy(UnitedConfig(), rooms, Primitives(rooms.action_names), Rules(), 100, [0])

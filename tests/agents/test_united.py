@@ -99,7 +99,7 @@ def numpy_loss(config, stage, network, target, steps, decisions):
         target_choices, target_actions, _ = numpy_outputs(target, after)
         for head, goal in enumerate(goals):
             part = "basic policy" if head == 0 else "option policies"
-            reward = -1.0 + (after if head == 0 else 10.0 * (after == goal))
+            reward = after - 7.0 if head == 0 else 10.0 * (after == goal) - 1.0
             if head == 0 and "manager" in stage.learns:
                 later = best(target_choices, next_choices, np.ones(3))
             else:
@@ -234,6 +234,7 @@ EXACT = UnitedConfig(
     shared="nothing",
     learning_rate=((0.0, 3e-2), (0.4, 1e-2), (1.0, 1e-4)),
     learning_starts=200,
+    replay_capacity=4000,  # decisions that the heads took while they learned are forgotten
     target_period=20,
     epsilon=((0.0, 1.0),),
     task_epsilon=((0.0, 1.0),),
@@ -241,7 +242,7 @@ EXACT = UnitedConfig(
     task_environments=2,
     reward_scale=0.2,
     decision_cost=0.0,
-    option_cap=4,
+    max_option_steps=4,
 )
 
 
@@ -265,7 +266,9 @@ def test_every_head_learns_its_exact_table():
             inside = live & (cells != (2, 4)[head - 1])
             np.testing.assert_allclose(outputs.actions[inside, head] / 0.2, wanted[inside], atol=0.1)
         np.testing.assert_array_equal(outputs.ended, np.stack([cells == 2, cells == 4], axis=1))
-        options = tabulate_options(UnitedOptions(CORRIDOR, network, choices(OPTIONS), config.option_cap), tables.space)
+        options = tabulate_options(
+            UnitedOptions(CORRIDOR, network, choices(OPTIONS), config.max_option_steps), tables.space
+        )
         wanted = option_value_iteration(tables, options, GAMMA).option_values
         np.testing.assert_allclose(outputs.choices[live] / 0.2, wanted[live], atol=0.15)
         flat = value_iteration(tables, GAMMA).action_values
@@ -310,5 +313,5 @@ def test_bad_settings_are_refused():
         Stage(0.0, ("trunk",))
     with pytest.raises(InvalidConfig, match="decision_cost is -1"):
         UnitedConfig(decision_cost=-1.0)
-    with pytest.raises(InvalidConfig, match="option_cap is 0"):
-        UnitedConfig(option_cap=0)
+    with pytest.raises(InvalidConfig, match="max_option_steps is 0"):
+        UnitedConfig(max_option_steps=0)
