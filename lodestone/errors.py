@@ -46,6 +46,10 @@ class Unbounded(LodestoneError):
     """Without a discount a cycle of states pays, so that there is no finite optimum."""
 
 
+class CannotDiscover(LodestoneError):
+    """A world, or trajectories, without what a method of discovery looks for: no success, no edge, pieces apart."""
+
+
 class Diverged(LodestoneError):
     """A loss or a parameter stopped being a finite number during training."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
@@ -57,3 +58,22 @@ class Task(Environment):
 
     def render(self, state: State) -> UInt8[np.ndarray, "height width 3"]:
         return self.environment.render(state)
+
+
+def endless(environment: Environment) -> Task:
+    """The world without its task: an episode begins as before, nothing ends it and nothing is paid."""
+    return Task(environment, "endless", _as_before, _never, _nothing)
+
+
+def _as_before(environment: Environment) -> tuple[Float[Array, " I"], State]:
+    return environment.initial_distribution()
+
+
+def _never(environment: Environment, state: State) -> Bool[Array, ""]:
+    del environment, state
+    return jnp.bool_(False)
+
+
+def _nothing(environment: Environment, state: State, action: Int[Array, ""], next_state: State) -> Float[Array, ""]:
+    del environment, state, action, next_state
+    return jnp.float32(0)
