@@ -116,6 +116,10 @@ def make_playback() -> Playback:
     available[np.arange(steps), option] = True
     values = 87.0 - (steps - np.arange(steps))[:, None] * 0.3 - rng.gamma(2.0, 2.0, (steps, len(OPTIONS)))
     values[np.arange(steps), option] = 87.0 - (steps - np.arange(steps)) * 0.3
+    termination = rng.random((steps, len(OPTIONS)))
+    termination[np.arange(1, steps), option[:-1]] = np.where(chosen[1:], 0.98, 0.03)
+    termination[:, : len(ACTIONS)] = 1.0
+    termination[1, GO_DOWN] = np.nan
     total_reward = -np.arange(1.0, steps + 1)
     total_reward[-1] += 100.0
     return Playback(
@@ -129,7 +133,7 @@ def make_playback() -> Playback:
         action=np.array(action),
         values=values,
         available=available,
-        termination=np.where(np.arange(len(OPTIONS)) < len(ACTIONS), 1.0, rng.random((steps, len(OPTIONS)))),
+        termination=termination,
         total_reward=total_reward,
     )
 

@@ -44,6 +44,7 @@ from lodestone.report.page import (
 )
 from lodestone.report.palette import AGENTS, option_colours, text_on
 from lodestone.report.results import THRESHOLD_WINDOW, Row, Summary, agent_rows
+from lodestone.report.stopping import on_arrival, with_a_say
 
 
 def write_report(
@@ -206,6 +207,8 @@ def _player(playback: Playback) -> str:
     colours = option_colours(playback.option_names, playback.action_names)
     frames: dict[bytes, int] = {}  # picture -> its number; an action without effect shows the same picture again
     frame = [frames.setdefault(picture.tobytes(), len(frames)) for picture in playback.pictures]
+    has_say = with_a_say(playback)
+    stops = has_say.any()
     data = {
         "frames": [_data_uri(playback.pictures[frame.index(number)]) for number in range(len(frames))],
         "frame": frame,
@@ -218,16 +221,23 @@ def _player(playback: Playback) -> str:
         "action": playback.action,
         "values": playback.values.astype(np.float64).round(3),
         "available": playback.available,
+        "termination": playback.termination.astype(np.float64).round(3) if stops else None,
+        "hasSay": has_say,
+        "onArrival": [on_arrival(playback, step) for step in range(len(playback.option))],
         "reward": playback.total_reward.astype(np.float64).round(3),
     }
     # A script ends at the first "</script", whatever stands around it.
     text = json.dumps(json_safe(data), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     tiny = ' class="tiny"' if playback.pictures.shape[2] < 160 else ""
+    heading, hint = "<h3>Q(s, option)</h3>", ""
+    if stops:
+        heading = f'<div class="headings">{heading}<h3>β(s)<span> stops here</span></h3></div>'
+        hint = " β: probability that the option, had it run until here, would stop here; framed: the one that had run."
     name = f"Greedy episode of {escape(playback.agent)}, seed {playback.seed}"
     return f"""<div class="card">
 <h3>{name}</h3>
 <p class="muted">After training, without exploration.</p>
-<div class="player" role="group" tabindex="0" aria-label="{name}: player">
+<div class="player{" stopping" if stops else ""}" role="group" tabindex="0" aria-label="{name}: player">
 <script type="application/json">{text}</script>
 <div class="stage"><img{tiny} src="{_data_uri(playback.pictures[0])}" alt="The start of the episode"></div>
 <div>
@@ -236,9 +246,9 @@ def _player(playback: Playback) -> str:
 <dt>Primitive action</dt><dd class="action"></dd>
 <dt>Return so far</dt><dd class="return"></dd>
 </dl>
-<h3>Q(s, option)</h3>
+{heading}
 <ul class="bars"></ul>
-<p class="note">Bars from <span class="range"></span>; struck out: not available.</p>
+<p class="note">Bars from <span class="range"></span>; struck out: not available.{hint}</p>
 </div>
 <div class="timeline" aria-hidden="true"></div>
 <div class="controls">

@@ -1,4 +1,4 @@
-"""Playing an episode in the terminal: the picture in half blocks, the running option and its value."""
+"""Playing an episode in the terminal: the picture in half blocks, the running option, values and terminations."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lodestone.agents.playing import Playback
+from lodestone.report.stopping import on_arrival, with_a_say
 
 WIDTH = 56
 """Columns of the picture."""
@@ -24,7 +25,7 @@ def show(playback: Playback, delay: float) -> None:
     length = len(playback.option)
     if not console.is_terminal:
         for step in range(length):
-            console.print(_line(playback, step), highlight=False)
+            console.print(_line(playback, step), highlight=False, soft_wrap=True)
         return
     with Live(console=console, refresh_per_second=20) as live:
         for step in range(length):
@@ -38,6 +39,8 @@ def _line(playback: Playback, step: int) -> str:
     option = playback.option_names[playback.option[step]]
     value = playback.values[step, playback.option[step]]
     begins = "begins" if playback.chosen[step] else "goes on"
+    if said := on_arrival(playback, step):
+        begins += f" ({said})"
     return (
         f"step {step + 1:3d}: {option} {begins}, Q {value:.2f}, action {playback.action_names[playback.action[step]]}, "
         f"return {playback.total_reward[step]:g}"
@@ -46,9 +49,15 @@ def _line(playback: Playback, step: int) -> str:
 
 def _screen(playback: Playback, step: int, picture: UInt8[np.ndarray, "height width 3"]) -> Group:
     values = Table("option", "Q", box=None)
+    if stops := with_a_say(playback).any():
+        values.add_column("β")
     for index, name in enumerate(playback.option_names):
         style = "bold green" if index == playback.option[step] else "" if playback.available[step, index] else "dim"
-        values.add_row(name, f"{playback.values[step, index]:8.2f}", style=style)
+        cells = [name, f"{playback.values[step, index]:8.2f}"]
+        if stops:
+            beta = playback.termination[step, index]
+            cells.append("" if np.isnan(beta) else f"{beta:.2f}")
+        values.add_row(*cells, style=style)
     return Group(half_blocks(picture), Text(_line(playback, step)), values)
 
 

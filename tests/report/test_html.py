@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_comparison import GATES, SETTINGS, make_comparison, make_playback
+from fake_comparison import GATES, OPTIONS, SETTINGS, make_comparison, make_playback
 from page_parser import HOSTILE, Page
 
 from lodestone.experiments.comparison import Comparison, Gate
 from lodestone.report.html import write_player, write_report
 from lodestone.report.results import agent_rows
+from lodestone.report.stopping import on_arrival
 
 
 def report(path: Path, comparisons: list[Comparison], gates: tuple[Gate, ...] = GATES) -> tuple[str, Page]:
@@ -99,6 +100,34 @@ def test_equal_pictures_are_stored_once_and_missing_values_are_null(tmp_path: Pa
     data = json.loads(page.scripts[0], parse_constant=lambda name: pytest.fail(name))
     assert len(data["frames"]) == 1
     assert data["values"][0][:3] == [None] * 3
+
+
+def test_terminations_stand_beside_the_values(tmp_path: Path) -> None:
+    playback = make_playback()
+    write_player(playback, tmp_path / "player.html")
+    page = Page((tmp_path / "player.html").read_text(encoding="utf-8"))
+    data = json.loads(page.scripts[0])
+    expected = [[None if np.isnan(beta) else round(beta, 3) for beta in row] for row in playback.termination.tolist()]
+    assert data["termination"] == expected
+    assert data["termination"][1][OPTIONS.index("go-down")] is None
+    assert data["hasSay"] == [False] * 6 + [True] * 2
+    assert data["onArrival"] == [on_arrival(playback, step) for step in range(len(playback.option))]
+    assert "player stopping" in page.values("class")
+    assert {"Q(s, option)", "β(s)"} <= set(page.texts)
+
+
+@pytest.mark.parametrize("everywhere", [np.nan, 1.0])
+def test_no_terminations_are_shown_where_they_have_no_say(everywhere: float, tmp_path: Path) -> None:
+    playback = make_playback()
+    silent = replace(playback, termination=np.full_like(playback.termination, everywhere))
+    write_player(silent, tmp_path / "player.html")
+    page = Page((tmp_path / "player.html").read_text(encoding="utf-8"))
+    data = json.loads(page.scripts[0])
+    assert data["termination"] is None
+    assert set(data["onArrival"]) == {""}
+    assert "player" in page.values("class")
+    assert not any("β" in text for text in page.texts)
+    assert "Q(s, option)" in page.texts
 
 
 def test_hostile_names_are_text(tmp_path: Path) -> None:
