@@ -24,16 +24,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
+from lodestone.agents.q_learning import STEPS_PER_ROUND, choose, largest, needed_chance
 from lodestone.envs.base import Environment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
-from lodestone.learning.policies import epsilon_greedy, mask_unavailable
+from lodestone.learning.policies import mask_unavailable
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Rules, deal, start_actor, tick
+from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.tabular import on_numbers
-from lodestone.planning.enumerated import enumerated
+from lodestone.planning.enumerated import enumerated, look_up_step
 from lodestone.planning.interruption import refuse_caps
 from lodestone.planning.option_models import check_available, tabulate_options
 from lodestone.planning.tables import tabulate
@@ -155,22 +155,23 @@ def intra_option_q_learning(
             available = numbered.initiation(state)
             if config.behaviour == "primitives":
                 available &= jnp.asarray(one_step)
-            choice = epsilon_greedy(noise[:2], values.table[state], available, epsilon)
-            actor, decision = tick(world, numbered, rules, deal(noise[2:], needed), actor, choice)
+            choice = choose(noise[:2], values.table[state], available, epsilon)
+            chance = deal(noise[2:], needed)
+            actor, decision = tick(world, numbered, rules, chance, actor, choice)
+            reward = look_up_step(world, chance.outcome, state, decision.action).reward  # of the step that was taken
 
             next_state = decision.transition.next_obs
             next_values = values.table[next_state]
             stops = jnp.where(jnp.asarray(one_step), 1.0, numbered.termination(next_state))
-            best = jnp.max(mask_unavailable(next_values, numbered.initiation(next_state)))
+            best = largest(mask_unavailable(next_values, numbered.initiation(next_state)))
             arriving = (1.0 - stops) * next_values + jnp.where(stops > 0, stops * best, 0.0)
             no_future = decision.terminated if rules.bootstrap_at_limit else decision.episode_ended
-            reward = world.reward(state, decision.action, next_state)
             target = reward + jnp.where(no_future, 0.0, rules.discount * arriving)
             weights = weights_of[state, decision.action]
             values, loss = update(values, state, decision.action, weights, target, learning_rate)
             return (values, actor), (decision, loss)
 
-        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
+        noise = uniforms(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
         (values, actor), (decisions, losses) = jax.lax.scan(step, (carry.values, carry.actor), noise)
         return Carry(values, actor, key), log_round(decisions, jnp.mean(losses))
 

@@ -8,20 +8,21 @@ once per option execution. With the primitive actions as the only options it is 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
+from itertools import accumulate
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment
+from lodestone.envs.base import UNROLLED, Environment
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
-from lodestone.learning.policies import epsilon_greedy
+from lodestone.learning.policies import epsilon_greedy, mask_unavailable
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.learning.targets import semi_markov_target
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Chance, Decision, Rules, deal, start_actor, tick
+from lodestone.options.execution import Actor, Chance, Decision, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.tabular import TabularOptions, on_numbers
 from lodestone.planning.enumerated import Enumerated, enumerated
 from lodestone.planning.option_models import check_available, tabulate_options
@@ -61,9 +62,30 @@ def update(
     error, too."""
     transition = decision.transition
     next_values = table[transition.next_obs]
-    target = semi_markov_target(transition.reward, transition.discount, next_values, transition.next_available)
+    best = largest(mask_unavailable(next_values, transition.next_available))
+    target = transition.reward + jnp.where(transition.discount > 0, transition.discount * best, 0.0)
     error = jnp.where(decision.valid, target - table[transition.obs, transition.action], 0.0)
     return table.at[transition.obs, transition.action].add(learning_rate * error), jnp.square(error)
+
+
+def largest(row: Float[Array, " O"]) -> Float[Array, ""]:
+    """The maximum of a row. A short one is gone through entry by entry: where many seeds learn side by side that is one
+    loop over them, and a reduction is several."""
+    if row.size > UNROLLED:
+        return jnp.max(row)
+    return reduce(lambda one, other: jnp.where(one > other, one, other), list(row))
+
+
+def choose(
+    uniform: Float[Array, " 2"], values: Float[Array, " O"], available: Bool[Array, " O"], epsilon: Float[Array, ""]
+) -> Int[Array, ""]:
+    """What `epsilon_greedy` chooses, entry by entry as in `largest`."""
+    if values.size > UNROLLED:
+        return epsilon_greedy(uniform, values, available, epsilon)
+    row = mask_unavailable(values, available)
+    least = jnp.where(uniform[0] < epsilon, jnp.finfo(jnp.float32).min, largest(row))
+    counts = list(accumulate(jnp.where(value >= least, 1.0, 0.0) for value in row))
+    return sum((count <= uniform[1] * counts[-1]).astype(jnp.int32) for count in counts[:-1]) + jnp.int32(0)
 
 
 def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...]:
@@ -115,13 +137,13 @@ def q_learning_on_numbers(
         def step(carry: tuple[Array, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Array, Actor], tuple]:
             table, actor = carry
             available = options.initiation(actor.state)
-            choice = epsilon_greedy(noise[:2], table[actor.state], available, epsilon)
+            choice = choose(noise[:2], table[actor.state], available, epsilon)
             actor, decision = tick(world, options, rules, deal(noise[2:], needed), actor, choice)
             table, loss = update(table, decision, learning_rate)
             return (table, actor), (decision, loss)
 
         # Random numbers are drawn for all steps together: one by one they would take longer than the steps.
-        noise = jax.random.uniform(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
+        noise = uniforms(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
         (table, actor), (decisions, losses) = jax.lax.scan(step, (carry.table, carry.actor), noise)
         return Carry(table, actor, key), log_round(decisions, jnp.mean(losses))
 

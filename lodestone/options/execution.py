@@ -7,6 +7,7 @@ options. Written for one environment; the training loop vmaps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lodestone.envs.base import Environment, initial_state, inverse_cdf, next_step, sample_initial
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import Options
+from lodestone.planning.enumerated import Enumerated, look_up_step
 from lodestone.types import State, Transition
 
 
@@ -124,6 +126,26 @@ def draw_chance(key: PRNGKeyArray) -> Chance:
     return Chance(action, termination, outcome, restart)
 
 
+def uniforms(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "*shape"]:
+    """The numbers of `jax.random.uniform(key, shape)`, for a loop that draws them over and over on a CPU.
+
+    There JAX compiles the rounds of its generator, Threefry-2x32 (Salmon et al. 2011), to a loop over memory, to be
+    compiled soon; written out they are one pass over registers, which takes half the time.
+    """
+    first, second = jax.random.key_data(key)
+    words = (first, second, first ^ second ^ jnp.uint32(0x1BD11BDA))
+    counter = jnp.arange(math.prod(shape), dtype=jnp.uint32).reshape(shape)
+    x, y = jnp.broadcast_to(words[0], shape), counter + words[1]
+    for group in range(5):
+        for rotation in ((13, 15, 26, 6), (17, 29, 16, 24))[group % 2]:
+            x += y
+            y = ((y << rotation) | (y >> (32 - rotation))) ^ x
+        x += words[(group + 1) % 3]
+        y += words[(group + 2) % 3] + jnp.uint32(group + 1)
+    mantissa = (x ^ y) >> 9
+    return jax.lax.bitcast_convert_type(mantissa | jnp.uint32(0x3F800000), jnp.float32) - 1.0
+
+
 def deal(uniform: Float[Array, " N"], needed: tuple[bool, ...]) -> Chance:
     """The random numbers of one tick out of N, where `needed` tells for each field of `Chance` whether it takes one."""
     numbers = iter(uniform)
@@ -149,7 +171,10 @@ def tick(
     discount_before = jnp.where(fresh, 1.0, actor.discount)
 
     action = inverse_cdf(options.action_probs(actor.state)[option], chance.action)
-    state, reward, terminated = next_step(environment, chance.outcome, actor.state, action)
+    if isinstance(environment, Enumerated):
+        state, reward, terminated = look_up_step(environment, chance.outcome, actor.state, action)
+    else:
+        state, reward, terminated = next_step(environment, chance.outcome, actor.state, action)
 
     elapsed = jnp.where(fresh, 0, actor.elapsed) + 1
     caps = jnp.asarray(options.max_steps, dtype=jnp.int32)
@@ -171,8 +196,10 @@ def tick(
     ended = stops | terminated | truncated
 
     # Cut by a limit before its own end: the option would have gone on, so only its own value may be bootstrapped from.
-    cut = truncated & ~stops
-    available = jnp.where(cut, jnp.arange(options.size) == option, options.initiation(state))
+    available = options.initiation(state)
+    if rules.step_limit is not None:
+        cut = truncated & ~stops
+        available = jnp.where(cut, jnp.arange(options.size) == option, available)
     no_future = terminated if rules.bootstrap_at_limit else terminated | truncated
     episode_return = actor.episode_return + reward
     decision = Decision(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from lodestone.envs.base import Environment
+from lodestone.envs.base import Environment, Step, inverse_cdf
 from lodestone.planning.tables import Tables
 from lodestone.types import Observation
 
@@ -70,3 +70,10 @@ def enumerated(tables: Tables, action_names: tuple[str, ...]) -> Enumerated:
         rewards=jnp.asarray(tables.rewards, dtype=jnp.float32),
         ends=jnp.asarray(tables.terminal),
     )
+
+
+def look_up_step(world: Enumerated, uniform: Float[Array, ""], state: Int[Array, ""], action: Int[Array, ""]) -> Step:
+    """What `next_step` does, without a search for the draw that led to the next state."""
+    outcome = inverse_cdf(world.probs[state, action], uniform) if world.num_outcomes > 1 else jnp.int32(0)
+    next_state = world.successors[state, action, outcome]
+    return Step(next_state, world.rewards[state, action, outcome], world.ends[next_state])

@@ -10,7 +10,7 @@ from corridor import LEFT, RIGHT, Corridor, Walk
 
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import Capped, Options, Primitives, Union
-from lodestone.options.execution import Decision, Rules, draw_chance, start_actor, tick
+from lodestone.options.execution import Decision, Rules, draw_chance, start_actor, tick, uniforms
 
 GAMMA = 0.9
 WALK = 2
@@ -128,3 +128,10 @@ def test_termination_is_a_probability():
 def test_bad_rules_are_refused(wrong):
     with pytest.raises(InvalidConfig, match=next(iter(wrong))):
         Rules(**wrong)
+
+
+@pytest.mark.parametrize("shape", [(32, 4), (7,), ()])
+def test_random_numbers_are_those_of_jax(shape):
+    for seed in range(3):
+        key = jax.random.fold_in(jax.random.key(seed), 11)
+        np.testing.assert_array_equal(jax.jit(uniforms, static_argnums=1)(key, shape), jax.random.uniform(key, shape))
