@@ -20,6 +20,18 @@ def take_name(kind: str, known: tuple[str, ...], command: str, words: list[str])
     return words[0], words[1:]
 
 
+def take_setting(kind: str, known: tuple[str, ...], command: str, words: list[str]) -> tuple[str, list[str]]:
+    """The name after `--kind` or `--kind=`, wherever it stands, and the other words: where it decides which settings
+    there are. Raises `InvalidConfig` without it and `UnknownName`."""
+    flag = f"--{kind}"
+    words = [part for word in words for part in (word.split("=", 1) if word.startswith(f"{flag}=") else [word])]
+    if flag not in words[:-1]:
+        raise InvalidConfig(f"`lodestone {command}` needs {flag} and one of: {', '.join(known)}.")
+    at = words.index(flag)
+    check_name(kind, words[at + 1], known)
+    return words[at + 1], words[:at] + words[at + 2 :]
+
+
 def take_environment(command: str, words: list[str]) -> tuple[str, type[Environment], list[str]]:
     """An environment's name, its class, and the rest. Raises `InvalidConfig` and `UnknownName`."""
     name, rest = take_name("environment", tuple(ENVIRONMENTS), command, words)

@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
-from lodestone.cli import plan, pretrain, reproduce, train, watch
+from lodestone.cli import discover, plan, pretrain, reproduce, train, watch
 from lodestone.devices import use_all_cores
+from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS
 from lodestone.errors import LodestoneError, check_name
 from lodestone.experiments.registry import EXPERIMENTS
@@ -22,6 +23,7 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "pretrain": pretrain.run,
     "watch": watch.run,
     "plan": plan.run,
+    "discover": discover.run,
 }
 """What each command does with the words after its name."""
 
@@ -35,6 +37,7 @@ commands:
   pretrain ENVIRONMENT       train an environment's options as Q-networks
   watch RUN                  play a saved policy
   plan ENVIRONMENT           the exact optimum
+  discover ENVIRONMENT       find options by --method {", ".join(METHODS)}
 
 environments: {", ".join(ENVIRONMENTS)}
 experiments: {", ".join((reproduce.MAGNET_TOWER, *EXPERIMENTS))}

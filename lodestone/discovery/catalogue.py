@@ -17,7 +17,7 @@ from lodestone.discovery.experience import Recording, observed, record
 from lodestone.discovery.knowledge import Knowledge, everything, everything_without_task, within
 from lodestone.discovery.squares import squares_of
 from lodestone.envs.base import Environment
-from lodestone.envs.state_space import reachable_states
+from lodestone.envs.state_space import StateSpace, reachable_states
 from lodestone.envs.task import endless
 from lodestone.options.base import Options, Primitives, Union
 from lodestone.options.tabular import TabularOptions
@@ -44,7 +44,9 @@ class Discovery(NamedTuple):
     """Options that were discovered, for any agent, and what of the world they come from."""
 
     found: Found
-    """Over the environment's own `reachable_states`."""
+    """Over the states of `space`; for each option a sub-goal."""
+    space: StateSpace
+    """The environment's own `reachable_states`."""
     squares: Int[np.ndarray, "S 2"] | None
     """Row and column of each state, where states are squares of a grid."""
     seen: int
@@ -74,14 +76,14 @@ def discover(
         trajectories = record(environment, recording)
         known = everything(tabulate(environment)) if source == "tables" else observed(trajectories)
         dense = diverse_density(known, trajectories, config, squares)
-        return Discovery(dense, squares, int(known.seen.sum()), trajectories.num_steps)
+        return Discovery(dense, space, squares, int(known.seen.sum()), trajectories.num_steps)
     steps = 0
     if source == "tables":
         known = everything_without_task(environment)
     else:
         trajectories = record(endless(environment), recording)
         known, steps = within(observed(trajectories), space), trajectories.num_steps
-    return Discovery(_FIND[type(config)](known, config), squares, int(known.seen.sum()), steps)
+    return Discovery(_FIND[type(config)](known, config), space, squares, int(known.seen.sum()), steps)
 
 
 _FIND: dict[type, Callable[[Knowledge, Any], Found]] = {

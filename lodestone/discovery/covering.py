@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import sparse
 
 from lodestone.discovery.graph import (
@@ -52,6 +52,10 @@ class Covering(NamedTuple):
 
     options: TabularOptions
     """For each pair from the highest state to the lowest and back, as far as a way is known."""
+    subgoals: Int[np.ndarray, " O"]
+    """Number of the state where each option goes."""
+    pair_of: Int[np.ndarray, " O"]
+    """Which pair each option belongs to, counted from 0."""
     pairs: tuple[tuple[int, int], ...]
     """Numbers of the states where each vector is highest and lowest."""
     connectivity: tuple[float, ...]
@@ -83,14 +87,19 @@ def covering(knowledge: Knowledge, config: CoveringConfig) -> Covering:
         edges = with_edge(edges, *ends)
     connectivity.append(fiedler(edges)[0])
 
-    destinations = []
-    for position, (high, low) in enumerate(pairs, start=1):
+    destinations, pair_of = [], []
+    for position, (high, low) in enumerate(pairs):
         for begin, end, way in ((high, low, "down"), (low, high, "up")):
-            destinations += _destination(graph, begin, end, f"cover-{position}-{way}", config.starts)
+            there = _destination(graph, begin, end, f"cover-{position + 1}-{way}", config.starts)
+            if there is not None:
+                destinations.append(there)
+                pair_of.append(position)
     if not destinations:
         raise CannotDiscover("No way is known from one end of the world to the other.")
     return Covering(
         options_to(knowledge, destinations),
+        np.array([destination.state for destination in destinations]),
+        np.array(pair_of),
         tuple((int(graph.states[high]), int(graph.states[low])) for high, low in pairs),
         tuple(connectivity),
         graph.spread(np.stack(vectors, axis=1)),
@@ -110,11 +119,11 @@ def with_edge(undirected: sparse.csr_array, one: int, other: int) -> sparse.csr_
     return as_undirected(undirected.maximum(new))
 
 
-def _destination(graph: InteractionGraph, begin: int, end: int, name: str, starts: Starts) -> list[Destination]:
-    """Nothing where no way leads from one vertex to the other."""
+def _destination(graph: InteractionGraph, begin: int, end: int, name: str, starts: Starts) -> Destination | None:
+    """None where no way leads from one vertex to the other."""
     there, here = int(graph.states[end]), int(graph.states[begin])
     region = nearest(graph, there, None)
     if not region[here]:
-        return []
+        return None
     only_here = np.arange(graph.num_states) == here
-    return [Destination(name, there, region, region if starts == "everywhere" else only_here)]
+    return Destination(name, there, region, region if starts == "everywhere" else only_here)
