@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.envs.task import Task
@@ -19,7 +19,10 @@ from lodestone.options.base import Primitives
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.planning.solve import optimum
-from lodestone.types import State
+from lodestone.types import Observation, State
+
+ActionValues = Callable[[Observation], Float[Array, " A"]]
+"""A network, or a head of one."""
 
 JUDGE_EVERY = 1000
 """Decisions between two judgements."""
@@ -58,7 +61,7 @@ class Pretrained:
 
 
 @eqx.filter_jit
-def _lengths(task: Task, network: QNetwork, starts: State, cap: int) -> tuple[Int[Array, " I"], Bool[Array, " I"]]:
+def _lengths(task: Task, network: ActionValues, starts: State, cap: int) -> tuple[Int[Array, " I"], Bool[Array, " I"]]:
     """Steps taken from each start, and whether the task was completed."""
 
     def run(state: State) -> tuple[Array, Array]:
@@ -76,7 +79,7 @@ def _lengths(task: Task, network: QNetwork, starts: State, cap: int) -> tuple[In
     return jax.vmap(run)(starts)
 
 
-def judge(task: Task, network: QNetwork, cap: int) -> Judgement:
+def judge(task: Task, network: ActionValues, cap: int) -> Judgement:
     """Play the greedy policy from every start of a deterministic task, for at most `cap` steps each."""
     probs, starts = task.initial_distribution()
     steps, done = (np.asarray(leaf) for leaf in _lengths(task, network, starts, cap))

@@ -46,7 +46,6 @@ from lodestone.learning.united_network import (
     UnitedNetwork,
     each_head,
     init_united_network,
-    one_head,
 )
 from lodestone.options.execution import Decision, Rules
 from lodestone.types import State, Transition
@@ -450,10 +449,8 @@ def united(
             stepped, next_task_actors = [ticks.step], []
             of_tasks = uniform[config.environments :].reshape(len(options), config.task_environments, 4)
             for position, (option, actor) in enumerate(zip(options, task_actors, strict=True)):
-                head = one_head(network.policies, BASIC + 1 + position)
-                values = jax.vmap(lambda state, head=head: head(network.features(environment.observe(state))))(
-                    actor.state
-                )
+                head = network.policy(BASIC + 1 + position)
+                values = jax.vmap(lambda state, head=head: head(environment.observe(state)))(actor.state)
                 actor, step = jax.vmap(partial(task_tick, option, config.task_step_limit), in_axes=(0, None, 0, 0))(
                     values, task_epsilon, of_tasks[position], actor
                 )

@@ -7,10 +7,16 @@ are not in it: they have figures, presets and saved policies of their own.
 from __future__ import annotations
 
 from lodestone.errors import check_name
-from lodestone.experiments import hallways, machines, taxi, two_rooms
+from lodestone.experiments import hallways, machines, taxi, two_rooms, united
 from lodestone.experiments.study import Experiment
 
-_ALL: tuple[Experiment, ...] = (hallways.EXPERIMENT, machines.EXPERIMENT, taxi.EXPERIMENT, two_rooms.EXPERIMENT)
+_ALL: tuple[Experiment, ...] = (
+    hallways.EXPERIMENT,
+    machines.EXPERIMENT,
+    taxi.EXPERIMENT,
+    two_rooms.EXPERIMENT,
+    united.EXPERIMENT,
+)
 
 EXPERIMENTS: dict[str, Experiment] = {one.name: one for one in _ALL}
 """By name, in the order in which they are listed."""

@@ -42,6 +42,10 @@ class UnitedNetwork(eqx.Module):
         """What the heads work on."""
         return observation if self.trunk is None else self.trunk(observation)
 
+    def policy(self, position: int) -> PolicyHead:
+        """One of the policies by itself: the basic one, or an option's."""
+        return PolicyHead(self.trunk, one_head(self.policies, position))
+
     def __call__(self, observation: Observation) -> Outputs:
         """One pass of the trunk, then every head."""
         features = self.features(observation)
@@ -50,6 +54,16 @@ class UnitedNetwork(eqx.Module):
             actions=each_head(self.policies, features),
             termination=jax.nn.softmax(each_head(self.terminations, features), axis=1)[:, -1],
         )
+
+
+class PolicyHead(eqx.Module):
+    """Observation -> values of the A actions, by one policy head and the trunk below it."""
+
+    trunk: Trunk | None
+    head: QNetwork
+
+    def __call__(self, observation: Observation) -> Float[Array, " A"]:
+        return self.head(observation if self.trunk is None else self.trunk(observation))
 
 
 class Outputs(NamedTuple):
