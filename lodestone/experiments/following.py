@@ -35,6 +35,16 @@ class Followed(NamedTuple):
             rows.append(np.insert(judged, 0, np.nan)[np.searchsorted(count, grid, side="right")])
         return np.stack(rows)
 
+    def episode_lengths(self, episodes: int) -> Float[np.ndarray, "N E"]:
+        """Primitive steps of each seed's first episodes, means of the last ten; not a number where it did not finish so
+        many."""
+        seeds = self.judged.shape[1]
+        lengths = np.full((seeds, episodes), np.nan)
+        for seed in range(seeds):
+            steps = self.history.episodes(seed).length_steps[:episodes]
+            lengths[seed, : len(steps)] = steps
+        return np.stack([lengths[:, max(0, last - 9) : last + 1].mean(axis=1) for last in range(episodes)], axis=1)
+
 
 def follow(
     algorithm: Algorithm,

@@ -127,24 +127,13 @@ def _follow(
     )
 
 
-def _episode_lengths(one: Followed) -> Float[np.ndarray, "N E"]:
-    """Steps of each seed's first episodes, not a number where it did not finish so many; means of ten."""
-    seeds = one.judged.shape[1]
-    lengths = np.full((seeds, EPISODES), np.nan)
-    for seed in range(seeds):
-        steps = one.history.episodes(seed).length_steps[:EPISODES]
-        lengths[seed, : len(steps)] = steps
-    ten = np.stack([lengths[:, max(0, last - 9) : last + 1].mean(axis=1) for last in range(EPISODES)], axis=1)
-    return ten
-
-
 def _lengths(goal: str, followed: dict[tuple[str, str], Followed]) -> Panel:
     best, x = optimum(GOALS[goal]).optimal_steps, np.arange(1.0, EPISODES + 1)
     return Panel(
         f"Episodes, {goal}",
         "episode",
         "steps, mean of the last 10 episodes",
-        tuple(Series(name, x, _episode_lengths(followed[goal, name])) for name in LEARNING_RATES),
+        tuple(Series(name, x, followed[goal, name].episode_lengths(EPISODES)) for name in LEARNING_RATES),
         references=((f"optimum {best:.1f}", best),),
         log_x=True,
         y_range=(0.0, 600.0),
@@ -169,7 +158,7 @@ def _gates(exact: dict[tuple[str, str], OptionSolution], followed: dict[tuple[st
         at_most("sweeps, largest distance from the independent ones", float(np.abs(off[:, 2]).max()), 0),
     ]
     for goal in GOALS:
-        lengths = {name: _episode_lengths(followed[goal, name])[:, 9] for name in (BOTH, ACTIONS)}
+        lengths = {name: followed[goal, name].episode_lengths(EPISODES)[:, 9] for name in (BOTH, ACTIONS)}
         first = {name: float(np.nanmean(length)) for name, length in lengths.items()}
         errors = {name: float(followed[goal, name].judged[-1].mean()) for name in (BOTH, INTRA)}
         gates += [
