@@ -10,6 +10,12 @@ from lodestone.agents.q_learning import QLearningConfig
 from lodestone.agents.saved import MachinePolicy, Policy, load_options, load_policy, save_options, save_policy
 from lodestone.agents.training import train_policy
 from lodestone.devices import use_all_cores
+from lodestone.discovery.betweenness import BetweennessConfig
+from lodestone.discovery.catalogue import discover
+from lodestone.discovery.covering import CoveringConfig
+from lodestone.discovery.diverse_density import DiverseDensityConfig
+from lodestone.discovery.eigenoptions import EigenoptionsConfig
+from lodestone.discovery.experience import Recording
 from lodestone.envs.base import Environment
 from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
@@ -34,11 +40,15 @@ from lodestone.planning.solve import optimum
 from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph
 
 __all__ = [
+    "BetweennessConfig",
     "Capped",
     "Chain",
     "Child",
     "CorridorMaze",
+    "CoveringConfig",
     "DQNConfig",
+    "DiverseDensityConfig",
+    "EigenoptionsConfig",
     "Environment",
     "FourRooms",
     "HAMQConfig",
@@ -57,6 +67,7 @@ __all__ = [
     "Primitives",
     "QLearningConfig",
     "RandomMDP",
+    "Recording",
     "Rules",
     "Script",
     "Scripted",
@@ -68,6 +79,7 @@ __all__ = [
     "TwoRooms",
     "Union",
     "as_options",
+    "discover",
     "every_action",
     "go_down_task",
     "hallway_options",

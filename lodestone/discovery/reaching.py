@@ -67,13 +67,12 @@ def build_options(
     goes_on: Bool[np.ndarray, "S O"],
     actions: Int[np.ndarray, "S O"],
 ) -> TabularOptions:
-    """Options that take one action a state. Where nothing was tried they neither start nor go on."""
-    known = np.any(knowledge.tried, axis=1, keepdims=True)
+    """Options that take one action a state, stop where they do not go on, and have no cap."""
     return TabularOptions(
         knowledge.tables.space,
         names,
         (NO_CAP,) * len(names),
-        initiation_table=jnp.asarray(starts & known),
+        initiation_table=jnp.asarray(starts),
         policy_table=jnp.asarray(np.eye(knowledge.tables.num_actions, dtype=np.float32)[actions]),
-        termination_table=jnp.asarray(~(goes_on & known), dtype=jnp.float32),
+        termination_table=jnp.asarray(~goes_on, dtype=jnp.float32),
     )
