@@ -179,13 +179,13 @@ class MagnetArm(Environment):
         return jnp.where(arm_here, arm, brick * BRICK).astype(jnp.uint8)
 
     def observe(self, state: ArmState) -> Array:
-        """`rgb`: uint8 [rows * pixels, columns * pixels, 3]; `planes`: uint8 [rows, columns, 4], one plane per cell
-        code; `index`: int32 [], the state's number in `reachable_states`."""
+        """`rgb`: uint8 [rows * pixels, columns * pixels, 3]; `planes`: int8 [rows, columns, 4], one plane of 0 and
+        1 per cell code; `index`: int32 [], the state's number in `reachable_states`."""
         if self.observation == "index":
             return reachable_states(self).index_of(state)
         if self.observation == "planes":
             codes = self.cell_codes(state)
-            return (codes[..., None] == jnp.arange(4, dtype=jnp.uint8)[None, None]).astype(jnp.uint8)
+            return (codes[..., None] == jnp.arange(4, dtype=jnp.uint8)[None, None]).astype(jnp.int8)
         return _picture(self, state)
 
     def render(self, state: ArmState) -> UInt8[np.ndarray, "height width 3"]:

@@ -89,7 +89,7 @@ def test_made_by_name_it_passes_the_checker(observation: str) -> None:
     check_env(env.unwrapped)
     spaces = {
         "rgb": gymnasium.spaces.Box(0, 255, (18, 12, 3), np.uint8),
-        "planes": gymnasium.spaces.Box(0, 255, (6, 4, 4), np.uint8),
+        "planes": gymnasium.spaces.Box(-128, 127, (6, 4, 4), np.int8),
         "index": gymnasium.spaces.Discrete(1512),
     }
     assert env.observation_space == spaces[observation]

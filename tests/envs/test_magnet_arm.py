@@ -340,7 +340,7 @@ def test_planes_mark_the_code_of_each_cell() -> None:
     arm = MagnetArm(observation="planes")
     states = reachable_states(arm).states
     planes = np.asarray(jax.vmap(arm.observe)(states))
-    assert planes.dtype == np.uint8
+    assert planes.dtype == np.int8  # a network takes them as they are; uint8 would be a picture's brightness
     np.testing.assert_array_equal(planes.sum(axis=-1), 1)
     np.testing.assert_array_equal(planes.argmax(axis=-1), jax.vmap(arm.cell_codes)(states))
 
