@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from fake_study import make_study
 
@@ -291,6 +292,8 @@ REFUSED = [
     (["train", "united", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "united", "taxi"], "this environment has none"),
     (["train", "united", "magnet-arm", "--option-cap", "5"], "option_cap is given, but no options are"),
+    (["train", "united", "magnet-arm", "--start", "nowhere", "--out", "run"], "nowhere"),
+    (["train", "united", "magnet-arm", "--training", "manager", "--out", "run"], "needs a trained network to start"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),
     (["train", "dqn", "magnet-arm", "--seeds", "0"], "seeds is 0"),
     (["train", "dqn", "magnet-arm", "--no-primitives"], "at least one option"),
@@ -312,6 +315,24 @@ def test_bad_input_is_refused_in_a_sentence(words, sentence, capsys, tmp_path, m
     assert "Traceback" not in err
     assert out == ""
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_united_network_starts_as_another_ended_on_another_grid(capsys, tmp_path):
+    shape = ["--observation", "planes", "--kernels", "3", "--strides", "1", "--channels", "8", "--hidden", "16"]
+    short = ["--learning-starts", "100", "--steps", "400", "--json"]
+    words = ["train", "united", "magnet-arm", *shape, *short]
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert run(capsys, *words, "--pooling", *TINY, "--out", str(first))[0] == 0
+    larger = [*words, "--start", str(first), "--training", "manager", "--seeds", "2", "--out", str(second)]
+    code, _, err = run(capsys, *larger)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "have to be the same" in err
+    assert not second.exists()
+    assert run(capsys, *larger, "--pooling")[0] == 0
+    assert json.loads((second / "config.json").read_text())["start"] == str(first)
+    old, new = (load_policy(folder / "policy.safetensors").networks.trunk for folder in (first, second))
+    for was, stays in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True):
+        np.testing.assert_array_equal(stays, np.repeat(was, 2, axis=0))
 
 
 def test_an_output_folder_that_cannot_be_written_is_refused(capsys, tmp_path):

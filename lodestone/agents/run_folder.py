@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from lodestone import __version__
-from lodestone.agents.saved import AnyPolicy, save_policy
+from lodestone.agents.saved import AnyPolicy, load_policy, save_policy
 from lodestone.errors import CannotWrite
 from lodestone.files import prepare_folder, write_json
 from lodestone.learning.history import History
 
 CONFIG, METRICS, POLICY = "config.json", "metrics.jsonl", "policy.safetensors"
+
+
+def load_run(path: Path) -> AnyPolicy:
+    """The policy of a run's folder, or of a policy file. Raises `BadFile`."""
+    return load_policy(path / POLICY if path.is_dir() else path)
 
 
 class RunFolder:

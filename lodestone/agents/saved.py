@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lodestone import __version__
+from lodestone.agents.united import init_for
 from lodestone.envs.base import Environment, example_state
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
@@ -24,7 +25,7 @@ from lodestone.errors import BadFile, InvalidConfig, LodestoneError
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
 from lodestone.learning.united_execution import UnitedOptions, choices
-from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
+from lodestone.learning.united_network import Shared, UnitedNetwork
 from lodestone.machines.catalogue import machines
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Capped, Options, Primitives, Union
@@ -223,12 +224,7 @@ def _build_united_policy(environment: Environment, header: Recipe, arrays: Array
     recipe, seeds = header["united"], tuple(int(seed) for seed in header["seeds"])
     for_options = tuple(task_named(environment, name) for name in recipe["tasks"])
     shape, shared, cap = _build_shape(recipe["shape"]), recipe["shared"], int(recipe["option_cap"])
-    seen = jax.eval_shape(environment.observe, example_state(environment)).shape
-    actions, options = environment.num_actions, len(for_options)
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), len(seeds)))
-    template = jax.eval_shape(
-        jax.vmap(lambda key: init_united_network(shape, shared, seen, actions, options, key)), keys
-    )
+    template = united_template(environment, len(for_options), shape, shared, len(seeds))
     return UnitedPolicy(
         agent=str(header["agent"]),
         environment=environment,
@@ -241,6 +237,14 @@ def _build_united_policy(environment: Environment, header: Recipe, arrays: Array
         reward_scale=float(header["reward_scale"]),
         seeds=seeds,
     )
+
+
+def united_template(
+    environment: Environment, num_options: int, shape: NetworkConfig, shared: Shared, count: int
+) -> UnitedNetwork:
+    """Shapes and dtypes of `count` stacked united networks for this environment's observations."""
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
+    return jax.eval_shape(jax.vmap(lambda key: init_for(environment, num_options, shape, shared, key)), keys)
 
 
 def save_options(path: Path, options: Options, environment: Environment) -> None:
@@ -362,10 +366,7 @@ WIDTHS = ("kernels", "strides", "channels", "hidden")
 
 def _network_template(recipe: Recipe, environment: Environment, outputs: int, count: int) -> QNetwork:
     """Shapes and dtypes of `count` stacked networks for this environment's observations."""
-    widths = {
-        name: tuple(int(number) for number in recipe[name]) for name in ("kernels", "strides", "channels", "hidden")
-    }
-    config = NetworkConfig(**widths, pooling=bool(recipe["pooling"]))
+    config = _build_shape(recipe)
     observation = jax.eval_shape(environment.observe, example_state(environment))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
     return jax.eval_shape(jax.vmap(lambda key: init_q_network(config, observation.shape, outputs, key)), keys)

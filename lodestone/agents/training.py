@@ -16,7 +16,7 @@ from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.saved import AnyPolicy, MachinePolicy, Policy, UnitedPolicy
+from lodestone.agents.saved import AnyPolicy, MachinePolicy, Policy, UnitedPolicy, united_template
 from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment
 from lodestone.envs.task import Task
@@ -24,6 +24,7 @@ from lodestone.errors import InvalidConfig
 from lodestone.learning.history import History
 from lodestone.learning.loop import Algorithm, train
 from lodestone.learning.united_execution import choices
+from lodestone.learning.united_network import UnitedNetwork
 from lodestone.machines.catalogue import machines
 from lodestone.machines.configurations import configurations
 from lodestone.machines.machine import Hierarchy
@@ -63,12 +64,14 @@ def train_policy(
     hierarchy: Hierarchy | None = None,
     graph: TaskGraph | None = None,
     tasks: Sequence[Task] | None = None,
+    start: UnitedPolicy | None = None,
 ) -> tuple[AnyPolicy, History]:
     """Train all seeds at once for `length` decisions each (tabular agents and united networks: primitive steps).
 
     HAMQ learns in `hierarchy`, MAXQ in `graph`, and a united network the options that `tasks` are for (default: what
     the environment has ready-made); their `options` must be the primitive actions. What MAXQ leaves is the policy that
-    asks anew from the root down at every step.
+    asks anew from the root down at every step. A united network starts as that of `start`, the first seed as its first
+    one and so on, in turn; it may have been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
@@ -78,9 +81,10 @@ def train_policy(
         hierarchy = hierarchy or machines(environment)
     if isinstance(config, UnitedConfig):
         tasks = tuple(ready_made_tasks(environment) if tasks is None else tasks)
-    plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks)
+    plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks, start)
     history = History(len(seeds), plan.choices)
-    for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS)):
+    given = () if start is None else (_in_turn(start, len(seeds)),)
+    for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS), *given):
         history.add(chunk)
         steps = min(history.taken(position)[1] for position in range(len(seeds)))
         fraction = max(chunk.rounds / plan.rounds, steps / length if plan.ends_by_steps else 0.0)
@@ -110,9 +114,11 @@ def train_policy(
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
-def check_training(config: AgentConfig, environment: Environment, options: Options, rules: Rules) -> None:
+def check_training(
+    config: AgentConfig, environment: Environment, options: Options, rules: Rules, start: UnitedPolicy | None = None
+) -> None:
     """Raise what `train_policy` would raise before it begins to train."""
-    _plan(config, environment, options, rules, length=1)
+    _plan(config, environment, options, rules, length=1, start=start)
 
 
 class _Plan(NamedTuple):
@@ -139,7 +145,10 @@ def _plan(
     hierarchy: Hierarchy | None = None,
     graph: TaskGraph | None = None,
     tasks: Sequence[Task] | None = None,
+    start: UnitedPolicy | None = None,
 ) -> _Plan:
+    if start is not None and not isinstance(config, UnitedConfig):
+        raise InvalidConfig("Only a united network can start from one that was trained before.")
     match config:
         case DQNConfig():
             return _Plan(
@@ -154,6 +163,7 @@ def _plan(
             tasks = ready_made_tasks(environment) if tasks is None else tasks
             if not tasks:
                 raise InvalidConfig("A united network learns options by their tasks, and this environment has none.")
+            _check_start(config, environment, tasks, start)
             return _Plan(
                 algorithm=united(config, environment, tasks, rules, length),
                 rounds=config.rounds(length),
@@ -188,6 +198,37 @@ def _plan(
                 learned=lambda learned: jnp.asarray(polled_values(config, environment, graph, learned)),
                 ends_by_steps=True,
             )
+
+
+def _check_start(
+    config: UnitedConfig, environment: Environment, tasks: Sequence[Task], start: UnitedPolicy | None
+) -> None:
+    if start is None:
+        if config.training == "manager":
+            raise InvalidConfig(
+                "training is 'manager', which needs a trained network to start from: it has the options."
+            )
+        return
+    if start.choices != choices(tasks):
+        raise InvalidConfig(
+            f"The network to start from has the options {', '.join(start.choices[1:])}, but the new one has "
+            f"{', '.join(choices(tasks)[1:])}."
+        )
+    if (start.shape, start.shared) != (config.network, config.shared):
+        raise InvalidConfig(
+            f"The network to start from is {start.shape} and shares {start.shared!r}, but the new one would be "
+            f"{config.network} and share {config.shared!r}; they have to be the same."
+        )
+    wanted = united_template(environment, len(tasks), config.network, config.shared, len(start.seeds))
+    if jax.tree.map(jnp.shape, start.networks) != jax.tree.map(jnp.shape, wanted):
+        raise InvalidConfig(
+            "The network to start from was trained on pictures of another size; only one with pooling fits several."
+        )
+
+
+def _in_turn(start: UnitedPolicy, seeds: int) -> UnitedNetwork:
+    positions = np.arange(seeds) % len(start.seeds)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[positions], start.networks)
 
 
 def _refuse_options(agent: str, options: Options, environment: Environment) -> None:

@@ -10,9 +10,9 @@ Three things are learned from experience of primitive steps:
   semi-Markov target. What it remembers counts as long as the head that acted would still begin with the same action:
   as the heads learn, decisions that they would no longer take are of other options than those they are now.
 
-Which of these learn, and when, is a list of stages: one for all together (`JOINT`), or one after the other with the
-trunk frozen after the first (`SEQUENTIAL`), as the authors intended. What is shared is the network's `shared`: with
-"nothing", the same learner trains separate networks.
+Which of these learn, and when, is a list of stages: one for all together (`JOINT`), one after the other with the trunk
+frozen after the first (`SEQUENTIAL`), as the authors intended, or the manager alone over options that are there
+(`MANAGER_ONLY`). What is shared is the network's `shared`: with "nothing", the same learner trains separate networks.
 """
 
 from __future__ import annotations
@@ -79,7 +79,8 @@ SEQUENTIAL = (
     Stage(0.05, ("terminations",)),
     Stage(0.35, ("manager",)),
 )
-TRAINING = {"joint": JOINT, "sequential": SEQUENTIAL}
+MANAGER_ONLY = (Stage(1.0, ("basic policy", "manager")),)
+TRAINING = {"joint": JOINT, "sequential": SEQUENTIAL, "manager": MANAGER_ONLY}
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,9 @@ class UnitedConfig:
     """Shape of every head together with what lies below it."""
     shared: Shared = "hidden"
     """What the heads share; `nothing` makes every head a network of its own."""
-    training: Literal["joint", "sequential"] = "joint"
-    """All parts together, or one after the other."""
+    training: Literal["joint", "sequential", "manager"] = "joint"
+    """All parts together; or one after the other; or only what is not the options': the basic policy and the manager,
+    over options that were learned before and stay as they are."""
     max_option_steps: int = 21
     """Steps after which an option is stopped whatever its termination head says."""
     double: bool = True
@@ -354,6 +356,14 @@ def _concatenate(*states: State) -> State:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
 
 
+def init_for(
+    environment: Environment, num_options: int, shape: NetworkConfig, shared: Shared, key: PRNGKeyArray
+) -> UnitedNetwork:
+    """A network at random for what an environment shows. Raises what `init_united_network` raises."""
+    seen = jax.eval_shape(environment.observe, example_state(environment)).shape
+    return init_united_network(shape, shared, seen, environment.num_actions, num_options, key)
+
+
 def update(
     config: UnitedConfig,
     stage: Stage,
@@ -389,7 +399,7 @@ def united(
     """The algorithm for the training loop: options are given by their tasks, which are learned too.
 
     `steps`, the run's length, is what schedules and stages are fractions of; it bounds the replays' memory, too.
-    `stages` replaces what `config.training` says.
+    `stages` replaces what `config.training` says. `init` takes a network to start from, too.
     """
     stages = stages or TRAINING[config.training]
     rounds = config.rounds(steps)
@@ -399,20 +409,18 @@ def united(
     seen_per_round = config.ticks_per_round * (config.environments + len(options) * config.task_environments)
     learning_starts = config.rounds(config.learning_starts)
 
-    def init(key: PRNGKeyArray) -> Carry:
+    def init(key: PRNGKeyArray, start: UnitedNetwork | None = None) -> Carry:
         network_key, actor_key, key = jax.random.split(key, 3)
         state = example_state(environment)
-        shape = jax.eval_shape(environment.observe, state).shape
-        network = init_united_network(
-            config.network, config.shared, shape, environment.num_actions, len(options), network_key
-        )
+        if start is None:
+            start = init_for(environment, len(options), config.network, config.shared, network_key)
         real, whole = jnp.float32(0), jnp.int32(0)
         everything = jnp.zeros(len(options) + 1, dtype=bool)
         transition = Transition(state, whole, real, real, state, everything)
         learner = Learner(
-            network=network,
-            target=network,
-            adam=start_adam(network),
+            network=start,
+            target=start,
+            adam=start_adam(start),
             steps=empty_replay(Step(state, whole, state), _capacity(config.replay_capacity, seen_per_round, rounds)),
             decisions=empty_replay(
                 Remembered(transition, whole), _capacity(config.replay_capacity, config.steps_per_round, rounds)

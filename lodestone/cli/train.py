@@ -15,8 +15,8 @@ from rich.table import Table
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig, as_configured
 from lodestone.agents.playing import episodes_to_judge, play_many
-from lodestone.agents.run_folder import RunFolder
-from lodestone.agents.saved import load_options
+from lodestone.agents.run_folder import RunFolder, load_run
+from lodestone.agents.saved import UnitedPolicy, load_options
 from lodestone.agents.training import AGENTS, AgentConfig, check_training, train_policy
 from lodestone.cli.parsing import parse, settings_of, take_environment, take_name
 from lodestone.cli.printing import print_json
@@ -61,6 +61,8 @@ class Train(Generic[AgentT, EnvironmentT]):
     agents that learn within options, which take no caps."""
     primitives: bool = True
     """Whether the agent may choose primitive actions besides the options."""
+    start: Path | None = None
+    """Of a united network: the run, or policy file, of one to start from. One with pooling may be of another grid."""
     out: Path | None = None
     """Folder for config.json, metrics.jsonl and policy.safetensors; without it nothing is saved."""
     json: bool = False
@@ -81,7 +83,8 @@ def _train(train: Train, agent: str) -> None:
         raise InvalidConfig(f"steps is {train.steps}, but must be at least 1.")
     environment, rules = train.environment, train.rules
     options = _choose_options(train)
-    check_training(train.agent, environment, options, rules)
+    start = None if train.start is None else _load_start(train.start)
+    check_training(train.agent, environment, options, rules, start)
     if isinstance(train.agent, MAXQConfig):
         _warn_of_unsafe_abstraction(train.agent, environment, rules.discount)
     seeds = tuple(range(train.seed, train.seed + train.seeds))
@@ -92,6 +95,7 @@ def _train(train: Train, agent: str) -> None:
             "environment": describe_environment(environment),
             "rules": dataclasses.asdict(rules),
             "options": list(options.names),
+            "start": None if train.start is None else str(train.start),
             "steps": train.steps,
             "seeds": list(seeds),
         }
@@ -108,7 +112,7 @@ def _train(train: Train, agent: str) -> None:
                 folder.log(history, seeds)
             return steps >= train.steps
 
-        policy, history = train_policy(train.agent, environment, options, rules, train.steps, seeds, tell)
+        policy, history = train_policy(train.agent, environment, options, rules, train.steps, seeds, tell, start=start)
     if folder is not None:
         folder.finish(policy)
 
@@ -161,6 +165,13 @@ def _train(train: Train, agent: str) -> None:
     Console().print(table)
     if train.out is not None:
         print(f"Saved in {train.out}; `lodestone watch {train.out}` plays it.")
+
+
+def _load_start(path: Path) -> UnitedPolicy:
+    policy = load_run(path)
+    if not isinstance(policy, UnitedPolicy):
+        raise InvalidConfig(f"{path} holds a policy of {policy.agent}; only a united network can be started from.")
+    return policy
 
 
 def _choose_options(train: Train) -> Options:

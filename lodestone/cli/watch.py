@@ -9,8 +9,7 @@ import jax
 from tyro.conf import Positional
 
 from lodestone.agents.playing import record
-from lodestone.agents.run_folder import POLICY
-from lodestone.agents.saved import load_policy
+from lodestone.agents.run_folder import load_run
 from lodestone.cli.parsing import parse
 from lodestone.errors import InvalidConfig
 from lodestone.files import prepare_folder
@@ -40,11 +39,10 @@ def run(words: list[str]) -> None:
 def _watch(watch: Watch) -> None:
     from lodestone.report import animation, html, terminal  # pictures are only needed here and in `reproduce`
 
-    path = watch.run / POLICY if watch.run.is_dir() else watch.run
-    policy = load_policy(path)
+    policy = load_run(watch.run)
     if not 0 <= watch.position < len(policy.seeds):
         raise InvalidConfig(
-            f"position is {watch.position}, but {path} holds {len(policy.seeds)} seeds, counted from 0."
+            f"position is {watch.position}, but {watch.run} holds {len(policy.seeds)} seeds, counted from 0."
         )
     playback = record(policy, watch.position, jax.random.key(0), policy.agent)
     for target, write in ((watch.gif, animation.write_gif), (watch.html, html.write_player)):

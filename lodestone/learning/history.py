@@ -44,6 +44,7 @@ class History:
     def __init__(self, seeds: int, choices: tuple[str, ...]) -> None:
         """`choices`: the names of what the learner chooses from, which the logs count."""
         self.choices = choices
+        self.seeds = seeds
         self._episodes: list[list[np.ndarray]] = [[] for _ in range(seeds)]
         self._taken = np.zeros((seeds, 2), dtype=np.int64)  # decisions, steps
         self.usage: list[Usage] = []

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from lodestone.errors import Diverged, InvalidConfig
 from lodestone.options.execution import Decision
@@ -54,8 +54,9 @@ def log_round(decisions: Decision, loss: Float[Array, ""]) -> RoundLog:
 class Algorithm(NamedTuple):
     """What the loop needs of a learner, for one seed."""
 
-    init: Callable[[PRNGKeyArray], Any]
-    """init(key) -> everything that the seed carries from round to round: learner, actors, key."""
+    init: Callable[..., Any]
+    """init(key) -> everything that the seed carries from round to round: learner, actors, key. What may start from
+    something learned before takes that, too: init(key, start)."""
     run_round: Callable[[Any, Int[Array, ""]], tuple[Any, RoundLog]]
     """run_round(carry, number of the round) -> (carry, log)."""
 
@@ -72,12 +73,13 @@ class Chunk(NamedTuple):
 
 
 def train(
-    algorithm: Algorithm, seeds: Sequence[int], rounds: int, rounds_per_chunk: int
+    algorithm: Algorithm, seeds: Sequence[int], rounds: int, rounds_per_chunk: int, *start: PyTree
 ) -> Iterator[tuple[Any, Chunk]]:
     """Train all seeds at once for so many rounds each; yields (carry, chunk) after every chunk of rounds.
 
     The carry has a leading seed axis and is valid until the next chunk is asked for (its memory is then reused).
-    Seeds do not influence one another. Raises `Diverged` when a loss is no longer finite.
+    `start`, with a leading seed axis, is what `algorithm.init` takes beside the key. Seeds do not influence one
+    another. Raises `Diverged` when a loss is no longer finite.
     """
     if not seeds:
         raise InvalidConfig("Training needs at least one seed.")
@@ -86,10 +88,12 @@ def train(
     rounds_per_chunk = min(rounds, rounds_per_chunk)
 
     devices = jax.devices()[: len(seeds)]
-    padded = [*seeds, *seeds[: -len(seeds) % len(devices)]]  # every device gets equally many
+    positions = np.arange(len(seeds) + -len(seeds) % len(devices)) % len(seeds)  # every device gets equally many
     mesh = Mesh(np.array(devices), ("seeds",))
     over_seeds, everywhere = PartitionSpec("seeds"), PartitionSpec()
-    keys = jax.device_put(jnp.stack([jax.random.key(seed) for seed in padded]), NamedSharding(mesh, over_seeds))
+    keys = jnp.stack([jax.random.key(seed) for seed in seeds])
+    given = jax.tree.map(lambda leaf: leaf[positions], (keys, *start))
+    given = jax.device_put(given, NamedSharding(mesh, over_seeds))
     spread = partial(jax.shard_map, mesh=mesh, check_vma=False)
     init = jax.jit(spread(jax.vmap(algorithm.init), in_specs=over_seeds, out_specs=over_seeds))
     run_chunk = jax.jit(
@@ -102,7 +106,7 @@ def train(
     )
 
     started = perf_counter()
-    carry = init(keys)
+    carry = init(*given)
     for first in range(0, rounds, rounds_per_chunk):
         count = min(rounds_per_chunk, rounds - first)
         carry, log = run_chunk(carry, jnp.int32(first), jnp.int32(count))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from corridor import Corridor
 from united_corridor import CORRIDOR, OPTIONS
 
+from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.playing import play, play_many, record
@@ -87,6 +91,55 @@ def test_a_united_network_is_trained_for_tasks_of_ones_own():
     np.testing.assert_array_equal(ended, np.stack([cells == 2, cells == 4], axis=1))
     values = policy.network(1)(CORRIDOR.observe(jnp.int32(0))).choices / config.reward_scale
     np.testing.assert_allclose(playback.values[0], values, rtol=1e-5)
+
+
+def train_corridor(config: UnitedConfig, seeds, start=None, steps=1500) -> UnitedPolicy:
+    primitives, rules = Primitives(CORRIDOR.action_names), Rules(discount=0.5, step_limit=50)
+    policy, _ = train_policy(config, CORRIDOR, primitives, rules, steps, seeds, tasks=OPTIONS, start=start)
+    assert isinstance(policy, UnitedPolicy)
+    return policy
+
+
+CORRIDOR_CONFIG = UnitedConfig(
+    network=NetworkConfig(kernels=(), strides=(), channels=(), hidden=(16,)), learning_starts=100, environments=4
+)
+
+
+def test_a_manager_learns_over_options_that_stay_as_they_are():
+    """Three seeds start from two networks in turn."""
+    before = train_corridor(CORRIDOR_CONFIG, [0, 1])
+    after = train_corridor(replace(CORRIDOR_CONFIG, training="manager"), [5, 6, 7], before)
+    for position, start in enumerate((0, 1, 0)):
+        old, new = before.network(start), after.network(position)
+        same = [(old.trunk, new.trunk), (old.terminations, new.terminations)]
+        same += [(old.policy(head), new.policy(head)) for head in (1, 2)]
+        for was, stays in same:
+            jax.tree.map(np.testing.assert_array_equal, was, stays)
+        for was, learns in ((old.manager, new.manager), (old.policy(0).head, new.policy(0).head)):
+            assert not np.allclose(was.layers[-1].weight, learns.layers[-1].weight, atol=1e-5)
+    assert not np.allclose(after.networks.manager.layers[-1].weight[0], after.networks.manager.layers[-1].weight[2])
+
+
+def test_learning_goes_on_where_it_was():
+    before = train_corridor(CORRIDOR_CONFIG, [0])
+    still = replace(CORRIDOR_CONFIG, learning_starts=1_000_000)
+    jax.tree.map(np.testing.assert_array_equal, before.networks, train_corridor(still, [3], before, steps=100).networks)
+
+
+def test_a_network_that_does_not_fit_is_no_start():
+    start = train_corridor(CORRIDOR_CONFIG, [0], steps=200)
+    wider = replace(CORRIDOR_CONFIG, network=replace(CORRIDOR_CONFIG.network, hidden=(17,)))
+    primitives, longer = Primitives(CORRIDOR.action_names), Corridor(length=9)
+    with pytest.raises(InvalidConfig, match="have to be the same"):
+        train_corridor(wider, [0], start)
+    with pytest.raises(InvalidConfig, match="needs a trained network to start from"):
+        train_corridor(replace(CORRIDOR_CONFIG, training="manager"), [0])
+    with pytest.raises(InvalidConfig, match="has the options to-2, to-4, but the new one has to-2"):
+        train_policy(CORRIDOR_CONFIG, CORRIDOR, primitives, Rules(), 100, [0], tasks=OPTIONS[:1], start=start)
+    with pytest.raises(InvalidConfig, match="another size"):
+        train_policy(CORRIDOR_CONFIG, longer, primitives, Rules(), 100, [0], tasks=OPTIONS, start=start)
+    with pytest.raises(InvalidConfig, match="Only a united network"):
+        train_policy(DQNConfig(), CORRIDOR, primitives, Rules(), 100, [0], start=start)
 
 
 def test_a_united_network_needs_tasks():
