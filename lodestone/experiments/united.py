@@ -120,7 +120,12 @@ def run(seeds: int, progress: Progress) -> Study:
             "exact optimum, options on every layout, terminations in every reachable state."
         ),
         seeds=seeds,
-        panels=tuple(_curves(size, learned) for size in SIZES),
+        panels=tuple(
+            learning_curves(
+                f"Learning, {size.name}", size.arm, {form: learned[size.name, form].history for form in FORMS}
+            )
+            for size in SIZES
+        ),
         tables=(*(_numbers(size, learned) for size in SIZES),),
         gates=tuple(_gates(learned)),
     )
@@ -176,37 +181,37 @@ def wrong_terminations(policy: UnitedPolicy, network: UnitedNetwork) -> int:
     return int((np.asarray(said) != true).sum())
 
 
-def _decisions_to(size: Size, one: Learned) -> list[float]:
+def decisions_to(history: History, threshold: float) -> list[float]:
     """Of each seed, until the mean return exceeds the threshold; infinite where it never does."""
     found = []
-    for seed in range(len(one.gaps)):
-        episodes = one.history.episodes(seed)
-        position = first_above(episodes, size.threshold, WINDOW)
+    for seed in range(history.seeds):
+        episodes = history.episodes(seed)
+        position = first_above(episodes, threshold, WINDOW)
         found.append(float("inf") if position is None else float(episodes.decisions[position]))
     return found
 
 
-def _curves(size: Size, learned: dict[tuple[str, str], Learned]) -> Panel:
-    of_size = {form: learned[size.name, form] for form in FORMS}
-    most = max(one.history.taken(seed)[0] for one in of_size.values() for seed in range(len(one.gaps)))
+def learning_curves(title: str, arm: MagnetArm, histories: dict[str, History]) -> Panel:
+    """Mean returns over decisions, beside the optimum."""
+    most = max(history.taken(seed)[0] for history in histories.values() for seed in range(history.seeds))
     x = np.linspace(0, most, 150)
 
-    def rows(one: Learned) -> Float[np.ndarray, "N X"]:
+    def rows(history: History) -> Float[np.ndarray, "N X"]:
         curves = []
-        for seed in range(len(one.gaps)):
-            episodes = one.history.episodes(seed)
+        for seed in range(history.seeds):
+            episodes = history.episodes(seed)
             means = np.insert(running_mean(episodes.total_reward, WINDOW), 0, np.nan)
             row = means[np.searchsorted(episodes.decisions, x, side="right")]
-            row[x > one.history.taken(seed)[0]] = np.nan
+            row[x > history.taken(seed)[0]] = np.nan
             curves.append(row)
         return np.stack(curves)
 
-    best = optimum(size.arm).optimal_return
+    best = optimum(arm).optimal_return
     return Panel(
-        f"Learning, {size.name}",
+        title,
         "decisions",
         f"return, mean of {WINDOW} episodes",
-        tuple(Series(form, x, rows(one)) for form, one in of_size.items()),
+        tuple(Series(name, x, rows(history)) for name, history in histories.items()),
         references=((f"optimum {best:g}", best),),
         y_range=(-300.0, 100.0),
     )
@@ -221,7 +226,7 @@ def _numbers(size: Size, learned: dict[tuple[str, str], Learned]) -> NumberTable
                 form,
                 one.parameters,
                 round(one.updates_per_second),
-                median(_decisions_to(size, one)),
+                median(decisions_to(one.history, size.threshold)),
                 f"{(one.gaps == 0).sum()} of {len(one.gaps)}",
                 float(np.median(one.gaps)),
                 float(one.gaps.max()),
