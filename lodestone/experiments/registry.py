@@ -7,14 +7,25 @@ are not in it: they have figures, presets and saved policies of their own.
 from __future__ import annotations
 
 from lodestone.errors import check_name
-from lodestone.experiments import discovery, hallways, machines, taxi, two_rooms, united
+from lodestone.experiments import (
+    discovery,
+    hallways,
+    machines,
+    option_usage,
+    taxi,
+    transfer,
+    two_rooms,
+    united,
+)
 from lodestone.experiments.study import Experiment
 
 _ALL: tuple[Experiment, ...] = (
     discovery.EXPERIMENT,
     hallways.EXPERIMENT,
     machines.EXPERIMENT,
+    option_usage.EXPERIMENT,
     taxi.EXPERIMENT,
+    transfer.EXPERIMENT,
     two_rooms.EXPERIMENT,
     united.EXPERIMENT,
 )
