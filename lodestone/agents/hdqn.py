@@ -165,18 +165,14 @@ class Carry(NamedTuple):
     key: PRNGKeyArray
 
 
-def exploration(
-    knots: Knots, fraction: Float[Array, ""], outcomes: Replay[Bool[Array, ""]]
-) -> Float[Array, " G"]:
+def exploration(knots: Knots, fraction: Float[Array, ""], outcomes: Replay[Bool[Array, ""]]) -> Float[Array, " G"]:
     """Probability of a random action under each goal, after a fraction of the run and the last pursuits' outcomes."""
     reached = jnp.sum(outcomes.storage, axis=1, dtype=jnp.float32)
     failure = 1 - reached / jnp.maximum(outcomes.size, 1).astype(jnp.float32)
     return jnp.minimum(piecewise_linear(knots, fraction), jnp.maximum(failure, knots[-1][1]))
 
 
-def without_repeat(
-    available: Bool[Array, " G"], last: Int[Array, ""]
-) -> Bool[Array, " G"]:
+def without_repeat(available: Bool[Array, " G"], last: Int[Array, ""]) -> Bool[Array, " G"]:
     """The available goals but the last one, unless it is the only one."""
     others = available & (jnp.arange(available.size) != last)
     return jnp.where(jnp.any(others), others, available)
@@ -324,7 +320,7 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
         chosen = decisions.transition.action
         holds = jax.vmap(options.termination)(decisions.transition.next_obs) > 0.5
         reached = jnp.take_along_axis(holds, chosen[:, None], axis=1)[:, 0]
-        of_goal = decisions.valid & (chosen == jnp.arange(len(goals), dtype=jnp.int32)[:, None])
+        of_goal = decisions.valid[None] & (chosen[None] == jnp.arange(len(goals), dtype=jnp.int32)[:, None])
         return jax.vmap(add, in_axes=(0, None, 0))(outcomes, reached, of_goal)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
