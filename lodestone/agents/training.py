@@ -13,10 +13,11 @@ from jaxtyping import PyTree
 
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
+from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.saved import AnyPolicy, MachinePolicy, Policy, UnitedPolicy
+from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, Policy, UnitedPolicy
 from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment
 from lodestone.envs.task import Task
@@ -28,6 +29,7 @@ from lodestone.machines.catalogue import machines
 from lodestone.machines.configurations import configurations
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Options
+from lodestone.options.catalogue import goals as ready_made_goals
 from lodestone.options.catalogue import tasks as ready_made_tasks
 from lodestone.options.execution import Rules
 from lodestone.planning.joint import joint_process
@@ -35,11 +37,12 @@ from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.task_graph import TaskGraph, tabulate_tasks
 
-AgentConfig = DQNConfig | UnitedConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
+AgentConfig = DQNConfig | UnitedConfig | HDQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
 
 AGENTS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
     "united": UnitedConfig,
+    "hdqn": HDQNConfig,
     "q-learning": QLearningConfig,
     "intra-option": IntraOptionConfig,
     "maxq": MAXQConfig,
@@ -64,11 +67,11 @@ def train_policy(
     graph: TaskGraph | None = None,
     tasks: Sequence[Task] | None = None,
 ) -> tuple[AnyPolicy, History]:
-    """Train all seeds at once for `length` decisions each (tabular agents and united networks: primitive steps).
+    """Train all seeds at once for `length` decisions each (tabular agents, united networks and h-DQN: primitive steps).
 
-    HAMQ learns in `hierarchy`, MAXQ in `graph`, and a united network the options that `tasks` are for (default: what
-    the environment has ready-made); their `options` must be the primitive actions. What MAXQ leaves is the policy that
-    asks anew from the root down at every step.
+    HAMQ learns in `hierarchy`, MAXQ in `graph`, a united network the options that `tasks` are for, and h-DQN to choose
+    among `tasks` as its goals (default: what the environment has ready-made); their `options` must be the primitive
+    actions. What MAXQ leaves is the policy that asks anew from the root down at every step.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
@@ -76,8 +79,8 @@ def train_policy(
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
     if isinstance(config, HAMQConfig):
         hierarchy = hierarchy or machines(environment)
-    if isinstance(config, UnitedConfig):
-        tasks = tuple(ready_made_tasks(environment) if tasks is None else tasks)
+    if isinstance(config, UnitedConfig | HDQNConfig):
+        tasks = _tasks_for(config, environment, tasks)
     plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks)
     history = History(len(seeds), plan.choices)
     for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS)):
@@ -90,14 +93,15 @@ def train_policy(
     if isinstance(config, HAMQConfig):
         assert hierarchy is not None
         return MachinePolicy(name, environment, hierarchy, rules, learned, tuple(seeds)), history
-    if isinstance(config, UnitedConfig):
+    if isinstance(config, UnitedConfig | HDQNConfig):
         assert tasks is not None
+        united_or_goals = UnitedPolicy if isinstance(config, UnitedConfig) else GoalPolicy
         return (
-            UnitedPolicy(
+            united_or_goals(
                 agent=name,
                 environment=environment,
                 tasks=tuple(tasks),
-                option_cap=config.max_option_steps,
+                option_cap=config.max_option_steps if isinstance(config, UnitedConfig) else config.max_goal_steps,
                 rules=rules,
                 shape=config.network,
                 shared=config.shared,
@@ -151,14 +155,21 @@ def _plan(
             )
         case UnitedConfig():
             _refuse_options("A united network", options, environment)
-            tasks = ready_made_tasks(environment) if tasks is None else tasks
-            if not tasks:
-                raise InvalidConfig("A united network learns options by their tasks, and this environment has none.")
+            tasks = _tasks_for(config, environment, tasks)
             return _Plan(
                 algorithm=united(config, environment, tasks, rules, length),
                 rounds=config.rounds(length),
                 of_carry=lambda carry: carry.learner.network,
                 choices=choices(tasks),
+            )
+        case HDQNConfig():
+            _refuse_options("h-DQN", options, environment)
+            tasks = _tasks_for(config, environment, tasks)
+            return _Plan(
+                algorithm=hdqn(config, environment, tasks, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.learner.network,
+                choices=tuple(task.name for task in tasks),
             )
         case QLearningConfig():
             return _tables(q_learning(config, environment, options, rules, length), options, length)
@@ -188,6 +199,19 @@ def _plan(
                 learned=lambda learned: jnp.asarray(polled_values(config, environment, graph, learned)),
                 ends_by_steps=True,
             )
+
+
+def _tasks_for(
+    config: UnitedConfig | HDQNConfig, environment: Environment, tasks: Sequence[Task] | None
+) -> tuple[Task, ...]:
+    """The given ones, or the ready-made ones. Raises `InvalidConfig` where there are none."""
+    of_options = isinstance(config, UnitedConfig)
+    if tasks is None:
+        tasks = ready_made_tasks(environment) if of_options else ready_made_goals(environment)
+    if not tasks:
+        needs = "A united network learns options by their tasks" if of_options else "h-DQN chooses among goals"
+        raise InvalidConfig(f"{needs}, and this environment has none.")
+    return tuple(tasks)
 
 
 def _refuse_options(agent: str, options: Options, environment: Environment) -> None:

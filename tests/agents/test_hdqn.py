@@ -1,4 +1,4 @@
-"""h-DQN: a plain NumPy second implementation, a plain interpreter of what is remembered, exact values of both levels."""
+"""h-DQN: a plain NumPy second implementation, a plain interpreter of what is remembered, exact values of both."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_a_united_network_comes_back(tmp_path):
 
 def test_a_united_network_for_tasks_of_ones_own_is_not_saved(tmp_path):
     own = Task(ARM, "own", random_layouts, arm_is_down, go_down_task(ARM).pay)
-    with pytest.raises(InvalidConfig, match="ready-made tasks"):
+    with pytest.raises(InvalidConfig, match="ready-made tasks or goals"):
         save_policy(tmp_path / "policy.safetensors", united_policy((own,)))
 
 
