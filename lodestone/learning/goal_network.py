@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from lodestone.envs.task import Task
+from lodestone.errors import InvalidConfig
 from lodestone.learning.networks import NetworkConfig, QNetwork, Trunk
 from lodestone.learning.united_network import Shared, each_head, init_trunk_and_heads, stack_heads
 from lodestone.options.base import Options
@@ -71,6 +72,10 @@ class GoalOptions(Options):
     """Probability of a random action under each goal."""
     cap: int = eqx.field(static=True)
     """Steps after which a goal is given up."""
+
+    def __check_init__(self) -> None:
+        if self.cap < 1:
+            raise InvalidConfig(f"A goal's step cap is {self.cap}, but a goal is pursued for at least one step.")
 
     @property
     def names(self) -> tuple[str, ...]:
