@@ -39,6 +39,7 @@ from lodestone.learning.replay import Replay, add, empty_replay, sample
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import semi_markov_loss
 from lodestone.learning.united_network import Shared
+from lodestone.options.base import NO_CAP
 from lodestone.options.execution import Actor, Decision, Rules
 from lodestone.types import State, Transition
 
@@ -51,8 +52,8 @@ class HDQNConfig:
     """Shape of every head together with what lies below it. Without any layers, on one-hot observations: tables."""
     shared: Shared = "nothing"
     """What the meta-controller and the controller's goals share; `nothing` makes each a network of its own."""
-    max_goal_steps: int = 50
-    """Steps after which a goal is given up."""
+    max_goal_steps: int | None = 50
+    """Steps after which a goal is given up; None for never, as in the paper."""
     repeat_goals: bool = True
     """Whether a goal that was given up may be chosen again at once. False is the authors' memory; a goal that was
     reached cannot be chosen where it holds anyway."""
@@ -97,6 +98,11 @@ class HDQNConfig:
     """Factor on the critic's rewards."""
 
     @property
+    def goal_cap(self) -> int:
+        """`max_goal_steps` as options have it."""
+        return NO_CAP if self.max_goal_steps is None else self.max_goal_steps
+
+    @property
     def steps_per_round(self) -> int:
         """Of all environments."""
         return self.ticks_per_round * self.environments
@@ -110,7 +116,6 @@ class HDQNConfig:
         for name in ("learning_rate", "epsilon", "goal_epsilon"):
             check_knots(name, getattr(self, name), 0.0, 1.0)
         for name in (
-            "max_goal_steps",
             "batch_size",
             "replay_capacity",
             "goal_replay_capacity",
@@ -122,6 +127,8 @@ class HDQNConfig:
         ):
             if getattr(self, name) < 1:
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
+        if self.goal_cap < 1:
+            raise InvalidConfig(f"max_goal_steps is {self.max_goal_steps}, but must be at least 1.")
         if self.learning_starts < 0:
             raise InvalidConfig(f"learning_starts is {self.learning_starts}, but must not be negative.")
         if not 0 <= self.controller_first <= 1:
@@ -276,7 +283,7 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
         network = init_goal_network(
             config.network, config.shared, shape, environment.num_actions, len(goals), network_key
         )
-        as_options = GoalOptions(goals, network, jnp.zeros(len(goals)), config.max_goal_steps)
+        as_options = GoalOptions(goals, network, jnp.zeros(len(goals)), config.goal_cap)
         pursuit = jax.tree.map(lambda leaf: leaf[0], no_decisions(environment, as_options, 1).transition)
         step = Pursued(state, jnp.int32(0), jnp.int32(0), state)
         learner = Learner(
@@ -332,7 +339,7 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         learner = carry.learner
         options = GoalOptions(
-            goals, learner.network, exploration(config.epsilon, fraction, carry.outcomes), config.max_goal_steps
+            goals, learner.network, exploration(config.epsilon, fraction, carry.outcomes), config.goal_cap
         )
         actors, decisions, pursued = collect(collect_key, carry.actors, options, goal_epsilon)
         learner = learner._replace(

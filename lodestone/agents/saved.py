@@ -132,7 +132,7 @@ class GoalPolicy:
     tasks: tuple[Task, ...]
     """The goals, in order."""
     option_cap: int
-    """Steps after which a goal is given up."""
+    """Steps after which a goal is given up; `NO_CAP` for never."""
     rules: Rules
     shape: NetworkConfig
     shared: Shared

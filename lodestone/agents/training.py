@@ -101,7 +101,7 @@ def train_policy(
                 agent=name,
                 environment=environment,
                 tasks=tuple(tasks),
-                option_cap=config.max_option_steps if isinstance(config, UnitedConfig) else config.max_goal_steps,
+                option_cap=config.max_option_steps if isinstance(config, UnitedConfig) else config.goal_cap,
                 rules=rules,
                 shape=config.network,
                 shared=config.shared,

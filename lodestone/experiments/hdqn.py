@@ -7,7 +7,6 @@ DQN and DQN with the two hand-written options. All learners of a world take equa
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,13 +14,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.playing import play
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.training import train_policy
+from lodestone.envs.base import Environment
 from lodestone.envs.chain import Chain
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.task import Task
@@ -40,12 +40,14 @@ from lodestone.options.subgoals import arrival, subgoal_options
 from lodestone.planning.option_models import evaluate_options, option_value_iteration, tabulate_options
 from lodestone.planning.solve import evaluate_policy, value_iteration
 from lodestone.planning.tables import Tables, tabulate
+from lodestone.types import State
 
 CHAIN, CHAIN_RULES = Chain(), Rules(discount=0.99, step_limit=100)
-CHAIN_STEPS, CHAIN_LOOKS = 100_000, 25
+CHAIN_STEPS, CHAIN_LOOKS = 100_000, 12
 TABLES, NETWORKS, Q_LEARNING = "h-DQN, tables", "h-DQN, networks", "Q-learning, flat"
 _CHAIN_CONFIG = HDQNConfig(
     network=NetworkConfig(kernels=(), strides=(), channels=(), hidden=()),
+    max_goal_steps=None,
     learning_rate=((0.0, 5e-3), (0.5, 3e-3), (1.0, 1e-4)),
     goal_replay_capacity=20_000,
     learning_starts=500,
@@ -68,6 +70,8 @@ ARM_STEPS = 100_000
 HDQN, DQN, DQN_OPTIONS = "h-DQN", "DQN", "DQN, two options"
 STEPS_PER_DECISION = 1.5
 """Of DQN with options, about: its schedules are in decisions, and its run ends after so many steps as the others."""
+ARM_WORK = 10.0 * CHAIN_STEPS
+"""What a learner of the tower takes, about, beside one of the chain."""
 WINDOW = 50
 """Episodes whose mean return is shown."""
 
@@ -80,8 +84,6 @@ class OnArm:
     rules: Rules
     length: int
     """Steps, or decisions."""
-    work: float
-    """What a step costs, about, in multiples of the cheapest."""
 
 
 def arm_learners() -> dict[str, OnArm]:
@@ -101,9 +103,9 @@ def arm_learners() -> dict[str, OnArm]:
         reward_scale=flat.reward_scale,
     )
     return {
-        HDQN: OnArm(config, rules, ARM_STEPS, 1.0),
-        DQN_OPTIONS: OnArm(with_options, rules, round(ARM_STEPS / STEPS_PER_DECISION), 1.0),
-        DQN: OnArm(flat, rules, ARM_STEPS, 1.0),
+        HDQN: OnArm(config, rules, ARM_STEPS),
+        DQN_OPTIONS: OnArm(with_options, rules, round(ARM_STEPS / STEPS_PER_DECISION)),
+        DQN: OnArm(flat, rules, ARM_STEPS),
     }
 
 
@@ -182,10 +184,10 @@ def _follow(name: str, seeds: int, progress: Progress) -> Followed:
 
         return looking(algorithm, CHAIN.action_names, rounds=CHAIN_STEPS // STEPS_PER_ROUND, judge=judge_flat)
 
-    of_chain, cap = goals(CHAIN), config.max_goal_steps
+    of_chain, cap = goals(CHAIN), config.goal_cap
 
     def judge(carry: Any) -> Float[np.ndarray, " N"]:
-        networks = carry.learner.network
+        networks = jax.tree.map(np.asarray, carry.learner.network)
         each = (jax.tree.map(lambda leaf, seed=seed: leaf[seed], networks) for seed in range(seeds))
         return np.array([greedy_return(tables, of_chain, network, cap) for network in each])
 
@@ -198,10 +200,14 @@ def greedy_return(tables: Tables, of_goals: tuple[Task, ...], network: GoalNetwo
     """Exact expected return, undiscounted, of the greedy meta-controller over the greedy controller."""
     options = GoalOptions(of_goals, network, jnp.zeros(len(of_goals)), cap)
     found = tabulate_options(options, tables.space)
-    environment = of_goals[0]
-    values = np.asarray(jax.vmap(lambda state: network.goal_values(environment.observe(state)))(tables.space.states))
+    values = _goal_values(of_goals[0], network, tables.space.states)
     choices = np.where(found.initiation.T, values, -np.inf).argmax(axis=1)
     return tables.initial_mean(evaluate_options(tables, found, choices, 1.0))
+
+
+@jax.jit
+def _goal_values(environment: Environment, network: GoalNetwork, states: State) -> Float[Array, "S G"]:
+    return jax.vmap(lambda state: network.goal_values(environment.observe(state)))(states)
 
 
 def _training_returns(one: Followed) -> Float[np.ndarray, " N"]:
@@ -213,14 +219,14 @@ def _training_returns(one: Followed) -> Float[np.ndarray, " N"]:
 def _build(name: str, seeds: int, progress: Progress) -> Tower:
     """One learner of the tower."""
     learner = arm_learners()[name]
-    progress.begin(f"hdqn: tower, {name}", learner.work * ARM_STEPS)
+    progress.begin(f"hdqn: tower, {name}", ARM_WORK)
 
     def tell(history: History, fraction: float) -> bool:
         steps = min(history.taken(seed)[1] for seed in range(seeds))
         recent = [history.episodes(seed).total_reward[-WINDOW:] for seed in range(seeds)]
         means = [returns.mean() for returns in recent if len(returns)]
         text = f"mean return {np.mean(means):.0f}" if means else ""
-        progress.advance(learner.work * max(fraction * ARM_STEPS, min(steps, ARM_STEPS)), text)
+        progress.advance(ARM_WORK * max(fraction, min(1.0, steps / ARM_STEPS)), text)
         return steps >= ARM_STEPS
 
     options: Options = Primitives(ARM.action_names)
@@ -320,6 +326,6 @@ EXPERIMENT = Experiment(
     "hdqn",
     "h-DQN: goals, a controller and a critic",
     seeds=20,
-    work=float(len(CHAIN_CONFIGS) * CHAIN_STEPS + ARM_STEPS * sum(one.work for one in arm_learners().values())),
+    work=float(len(CHAIN_CONFIGS) * CHAIN_STEPS + len(arm_learners()) * ARM_WORK),
     run=run,
 )

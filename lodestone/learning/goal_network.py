@@ -71,7 +71,7 @@ class GoalOptions(Options):
     epsilon: Float[Array, " G"]
     """Probability of a random action under each goal."""
     cap: int = eqx.field(static=True)
-    """Steps after which a goal is given up."""
+    """Steps after which a goal is given up; `NO_CAP` for never."""
 
     def __check_init__(self) -> None:
         if self.cap < 1:

@@ -385,7 +385,7 @@ def test_both_levels_learn_their_exact_tables():
             wanted = solve_subgoal(tables, arrival(tables, one, GAMMA), GAMMA).action_values
             inside = live & (cells != CELLS[number])
             np.testing.assert_allclose(actions[inside, number], wanted[inside], atol=0.02)
-        as_options = GoalOptions(WALKS, network, jnp.zeros(3), EXACT.max_goal_steps)
+        as_options = GoalOptions(WALKS, network, jnp.zeros(3), EXACT.goal_cap)
         options = tabulate_options(as_options, tables.space)
         wanted = option_value_iteration(tables, options, GAMMA).option_values
         found = np.asarray(jax.vmap(network.goal_values)(observations)) / EXACT.reward_scale
