@@ -254,8 +254,9 @@ def test_both_replays_hold_what_a_plain_interpreter_says(rules, repeat):
     assert int(steps.size) == rounds * config.steps_per_round == len(steps.storage.action)
 
     told = []  # (tick, environment, pursuit)
+    again = 0
     for lane in range(environments):
-        position, visited, start, episode, decisions, given_up = 2, False, None, 0, 0, None
+        position, visited, start, episode, decisions, given_up, before = 2, False, None, 0, 0, None, None
         for tick in range(rounds * config.ticks_per_round):
             step = one_of(steps.storage, tick * environments + lane)
             assert (int(step.state.position), bool(step.state.visited)) == (position, visited)
@@ -263,6 +264,7 @@ def test_both_replays_hold_what_a_plain_interpreter_says(rules, repeat):
                 start, elapsed, total, weight = (position, visited), 0, 0.0, 1.0
                 chosen = int(step.goal)
                 decisions += 1
+                again += decisions == 1 and chosen == before
                 assert POSITIONS[chosen] != position
                 assert repeat or chosen != given_up
             assert int(step.goal) == chosen
@@ -289,11 +291,12 @@ def test_both_replays_hold_what_a_plain_interpreter_says(rules, repeat):
                 may[chosen] = False
             kept = 0.0 if over or (limit and not rules.bootstrap_at_limit) else weight
             told.append((tick, lane, (start, chosen, total, kept, (position, visited), may)))
-            start, given_up = None, chosen
+            start, given_up, before = None, chosen, chosen
             if over or limit:
                 position, visited, episode, decisions, given_up = 2, False, 0, 0, None
 
     assert len(told) == int(found.size) > 100
+    assert again > 0  # a new episode remembers no goal
     kinds = set()
     for index, (_, _, (start, chosen, total, kept, end, may)) in enumerate(sorted(told)):
         move = one_of(found.storage, index)
