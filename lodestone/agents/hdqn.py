@@ -37,7 +37,7 @@ from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.replay import Replay, add, empty_replay, sample
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.learning.targets import semi_markov_loss
+from lodestone.learning.targets import Values, semi_markov_loss
 from lodestone.learning.united_network import Shared
 from lodestone.options.base import NO_CAP
 from lodestone.options.execution import Actor, Decision, Rules
@@ -219,25 +219,18 @@ def loss(
 ) -> Float[Array, ""]:
     """The controller's loss over B steps and, where `both` learn, the meta-controller's over B pursuits."""
 
-    def of_goal(one: GoalNetwork, seen: tuple) -> Float[Array, " A"]:
-        observation, goal = seen
-        return one.action_values(observation)[goal]
+    def under_goal(one: GoalNetwork) -> Values:
+        return lambda seen: one.action_values(seen[0])[seen[1]]
+
+    of_level = partial(semi_markov_loss, double=config.double, huber_delta=config.huber_delta)
+    taught = controller_batch(environment, goals, discount, config.critic_scale, steps)
+    of_controller = of_level(under_goal(network), under_goal(target), taught)
 
     observe = jax.vmap(environment.observe)
     pursuits = pursuits._replace(
         obs=observe(pursuits.obs), next_obs=observe(pursuits.next_obs), reward=config.reward_scale * pursuits.reward
     )
-    of_controller, of_meta = (
-        semi_markov_loss(online, old, batch, config.double, config.huber_delta)
-        for online, old, batch in (
-            (
-                partial(of_goal, network),
-                partial(of_goal, target),
-                controller_batch(environment, goals, discount, config.critic_scale, steps),
-            ),
-            (network.goal_values, target.goal_values, pursuits),
-        )
-    )
+    of_meta = of_level(network.goal_values, target.goal_values, pursuits)
     return of_controller + jnp.where(both, of_meta, 0.0)
 
 
