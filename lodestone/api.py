@@ -2,12 +2,21 @@
 
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
+from lodestone.agents.hdqn import HDQNConfig
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.playing import Playback, play, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.q_learning import QLearningConfig
-from lodestone.agents.saved import MachinePolicy, Policy, load_options, load_policy, save_options, save_policy
+from lodestone.agents.saved import (
+    GoalPolicy,
+    MachinePolicy,
+    Policy,
+    load_options,
+    load_policy,
+    save_options,
+    save_policy,
+)
 from lodestone.agents.training import train_policy
 from lodestone.devices import use_all_cores
 from lodestone.discovery.betweenness import BetweennessConfig
@@ -22,7 +31,7 @@ from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.random_mdp import RandomMDP
-from lodestone.envs.task import Task
+from lodestone.envs.task import Task, goal
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
@@ -51,7 +60,9 @@ __all__ = [
     "EigenoptionsConfig",
     "Environment",
     "FourRooms",
+    "GoalPolicy",
     "HAMQConfig",
+    "HDQNConfig",
     "Hierarchy",
     "Interrupting",
     "IntraOptionConfig",
@@ -82,6 +93,7 @@ __all__ = [
     "discover",
     "every_action",
     "go_down_task",
+    "goal",
     "hallway_options",
     "hierarchical_optimum",
     "lift_task",

@@ -244,6 +244,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("hamq", ["magnet-arm", *TINY], "20000"),
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
+        ("hdqn", ["magnet-arm", *TINY, *SMALL, "--reward-scale", "0.2", "--discount", "0.97"], "12000"),
     ],
 )
 def test_hierarchies_are_trained_saved_and_watched(agent, environment, steps, capsys, tmp_path):
@@ -291,6 +292,9 @@ REFUSED = [
     (["train", "hamq", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "united", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "united", "taxi"], "this environment has none"),
+    (["train", "hdqn", "taxi", "--out", "run"], "chooses among goals, and this environment has none"),
+    (["train", "hdqn", "magnet-arm", "--options", "lift"], "takes no options"),
+    (["train", "hdqn", "chain", "--success-window", "3"], "success_window must hold"),
     (["train", "united", "magnet-arm", "--option-cap", "5"], "option_cap is given, but no options are"),
     (["train", "united", "magnet-arm", "--start", "nowhere", "--out", "run"], "nowhere"),
     (["train", "united", "magnet-arm", "--training", "manager", "--out", "run"], "needs a trained network to start"),

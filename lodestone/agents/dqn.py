@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
-from lodestone.envs.base import Environment, example_state
+from lodestone.envs.base import Environment, observation_shape
 from lodestone.errors import InvalidConfig
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.collecting import collect, no_decisions, start_actors
@@ -26,7 +26,7 @@ from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
 from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.replay import Replay, add, empty_replay, sample
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.learning.targets import double_semi_markov_target, semi_markov_target
+from lodestone.learning.targets import semi_markov_loss
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Rules
 from lodestone.types import State, Transition
@@ -114,18 +114,8 @@ class Carry(NamedTuple):
 
 def loss(config: DQNConfig, network: QNetwork, target: QNetwork, batch: Transition) -> Float[Array, ""]:
     """Huber loss, summed over the batch, of Q(s, o) against the semi-Markov target."""
-    rewards = batch.reward * config.reward_scale
-    next_values = jax.vmap(target)(batch.next_obs)
-    if config.double:
-        preferences = jax.vmap(network)(batch.next_obs)
-        targets = jax.vmap(double_semi_markov_target)(
-            rewards, batch.discount, next_values, preferences, batch.next_available
-        )
-    else:
-        targets = jax.vmap(semi_markov_target)(rewards, batch.discount, next_values, batch.next_available)
-    values = jax.vmap(network)(batch.obs)
-    chosen = jnp.take_along_axis(values, batch.action[:, None], axis=1)[:, 0]
-    return jnp.sum(optax.huber_loss(chosen, jax.lax.stop_gradient(targets), delta=config.huber_delta))
+    scaled = batch._replace(reward=batch.reward * config.reward_scale)
+    return semi_markov_loss(network, target, scaled, config.double, config.huber_delta)
 
 
 def update(
@@ -165,8 +155,7 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
 
     def init(key: PRNGKeyArray) -> Carry:
         network_key, actor_key, key = jax.random.split(key, 3)
-        shape = jax.eval_shape(environment.observe, example_state(environment)).shape
-        network = init_q_network(config.network, shape, options.size, network_key)
+        network = init_q_network(config.network, observation_shape(environment), options.size, network_key)
         example = jax.tree.map(lambda leaf: leaf[0], no_decisions(environment, options, 1).transition)
         learner = Learner(
             network=network,

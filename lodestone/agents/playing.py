@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
-from lodestone.agents.saved import AnyPolicy, MachinePolicy, UnitedPolicy
+from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, Policy, UnitedPolicy
 from lodestone.envs.base import Environment
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
 from lodestone.learning.united_execution import play_united, trace_united
@@ -64,14 +64,14 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
         if isinstance(policy, UnitedPolicy):
             return play_united(policy.environment, policy.rules, policy.option_cap, learned, key, MAX_STEPS)
-        values = policy.values_of(learned)
-        return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
+        options = policy.options_of(learned) if isinstance(policy, GoalPolicy) else policy.options
+        return play_episode(policy.environment, options, policy.rules, policy.values_of(learned), key, MAX_STEPS)
 
     @jax.jit
     def run(learned: PyTree) -> Episode:
         return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(learned, keys)
 
-    return jax.tree.map(np.asarray, run(policy.networks if isinstance(policy, UnitedPolicy) else policy.learned))
+    return jax.tree.map(np.asarray, run(policy.learned if isinstance(policy, Policy) else policy.networks))
 
 
 def episodes_to_judge(environment: Environment) -> int:
@@ -95,8 +95,8 @@ def _play_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> J
 
 
 def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
-    """One greedy episode of the seed at this position, with its pictures. Of machines the options are the edges of
-    their choices: an edge runs until the next choice."""
+    """One greedy episode of the seed at this position, with its pictures. Of h-DQN the options are its goals; of
+    machines they are the edges of their choices: an edge runs until the next choice."""
     if isinstance(policy, MachinePolicy):
         return _record_machines(policy, position, key, agent)
     length = int(play(policy, key).steps[position])
@@ -106,6 +106,9 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
         environment, rules = policy.environment, policy.rules
         if isinstance(policy, UnitedPolicy):
             return trace_united(environment, rules, policy.option_cap, policy.network(position), key, length)
+        if isinstance(policy, GoalPolicy):
+            values = policy.values_of(policy.network(position))
+            return trace_episode(environment, policy.options(position), rules, values, key, length)
         return trace_episode(environment, policy.options, rules, policy.values(position), key, length)
 
     trace = jax.tree.map(np.asarray, run(key))
@@ -114,7 +117,7 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
     return Playback(
         agent=agent,
         seed=policy.seeds[position],
-        option_names=policy.choices if isinstance(policy, UnitedPolicy) else policy.options.names,
+        option_names=policy.options.names if isinstance(policy, Policy) else policy.choices,
         action_names=policy.environment.action_names,
         pictures=np.stack([policy.environment.render(state) for state in states]),
         option=trace.option,

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,20 +16,20 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lodestone import __version__
-from lodestone.agents.united import init_for
-from lodestone.envs.base import Environment, example_state
+from lodestone.envs.base import Environment, observation_shape
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Task
-from lodestone.errors import BadFile, InvalidConfig, LodestoneError
+from lodestone.errors import BadFile, InvalidConfig, LodestoneError, check_name
 from lodestone.files import read_arrays, write_arrays
+from lodestone.learning.goal_network import GoalNetwork, GoalOptions, init_goal_network
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
 from lodestone.learning.united_execution import UnitedOptions, choices
-from lodestone.learning.united_network import Shared, UnitedNetwork
+from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
 from lodestone.machines.catalogue import machines
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Capped, Options, Primitives, Union
-from lodestone.options.catalogue import scripted_options, task_named, tasks
+from lodestone.options.catalogue import goals, scripted_options, task_named, tasks
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.options.scripted import Scripted
@@ -122,7 +122,49 @@ class UnitedPolicy:
         return UnitedOptions(self.environment, self.network(position), self.choices, self.option_cap)
 
 
-AnyPolicy = Policy | MachinePolicy | UnitedPolicy
+@dataclass(frozen=True)
+class GoalPolicy:
+    """A trained meta-controller and controller, of one or more seeds."""
+
+    agent: str
+    """Name of the algorithm."""
+    environment: Environment
+    tasks: tuple[Task, ...]
+    """The goals, in order."""
+    option_cap: int
+    """Steps after which a goal is given up; `NO_CAP` for never."""
+    rules: Rules
+    shape: NetworkConfig
+    shared: Shared
+    networks: GoalNetwork
+    """With a leading seed axis."""
+    reward_scale: float
+    """Factor by which the meta-controller's values are larger than the environment's rewards."""
+    seeds: tuple[int, ...]
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Names of the goals."""
+        return tuple(task.name for task in self.tasks)
+
+    def network(self, position: int) -> GoalNetwork:
+        """Of the seed at this position."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.networks)
+
+    def options(self, position: int) -> GoalOptions:
+        """What that seed's meta-controller chooses from, as a set of options."""
+        return self.options_of(self.network(position))
+
+    def options_of(self, network: GoalNetwork) -> GoalOptions:
+        """The same of what one seed has learned."""
+        return GoalOptions(self.tasks, network, jnp.zeros(len(self.tasks)), self.option_cap)
+
+    def values_of(self, network: GoalNetwork) -> Callable[[State], Float[Array, " G"]]:
+        """Its Q2(s, .), in units of the environment's reward."""
+        return lambda state: network.goal_values(self.environment.observe(state)) / self.reward_scale
+
+
+AnyPolicy = Policy | MachinePolicy | UnitedPolicy | GoalPolicy
 
 
 def save_policy(path: Path, policy: AnyPolicy) -> None:
@@ -130,8 +172,8 @@ def save_policy(path: Path, policy: AnyPolicy) -> None:
     if isinstance(policy, MachinePolicy):
         _save_machine_policy(path, policy)
         return
-    if isinstance(policy, UnitedPolicy):
-        _save_united_policy(path, policy)
+    if isinstance(policy, UnitedPolicy | GoalPolicy):
+        _save_heads(path, policy)
         return
     recipe, arrays = _describe_options(policy.options, "options")
     network = _describe_network(policy.learned) if isinstance(policy.learned, QNetwork) else None
@@ -164,15 +206,31 @@ def _save_machine_policy(path: Path, policy: MachinePolicy) -> None:
     write_arrays(path, {"tables": np.asarray(policy.tables)}, header)
 
 
-def _save_united_policy(path: Path, policy: UnitedPolicy) -> None:
-    if not set(policy.tasks) <= set(tasks(policy.environment)):
-        raise InvalidConfig("Only united networks for an environment's ready-made tasks can be saved.")
+class _Heads(NamedTuple):
+    """A kind of policy of networks with one head, or more, for each of some tasks."""
+
+    policy: type[UnitedPolicy] | type[GoalPolicy]
+    init: Callable[..., PyTree]
+    ready_made: Callable[[Environment], tuple[Task, ...]]
+
+
+HEADS = {
+    "united": _Heads(UnitedPolicy, init_united_network, tasks),
+    "goals": _Heads(GoalPolicy, init_goal_network, goals),
+}
+"""By the name of their recipe."""
+
+
+def _save_heads(path: Path, policy: UnitedPolicy | GoalPolicy) -> None:
+    name, kind = next((name, kind) for name, kind in HEADS.items() if isinstance(policy, kind.policy))
+    if not set(policy.tasks) <= set(kind.ready_made(policy.environment)):
+        raise InvalidConfig("Only networks for an environment's ready-made tasks or goals can be saved.")
     header = {
         "kind": "policy",
         "version": __version__,
         "agent": policy.agent,
         "environment": describe_environment(policy.environment),
-        "united": {
+        name: {
             "tasks": [task.name for task in policy.tasks],
             "option_cap": policy.option_cap,
             "shape": asdict(policy.shape),
@@ -193,8 +251,9 @@ def load_policy(path: Path) -> AnyPolicy:
         environment = make_environment(header["environment"]["name"], **header["environment"]["parameters"])
         if "machines" in header:
             return _build_machine_policy(environment, header, arrays)
-        if "united" in header:
-            return _build_united_policy(environment, header, arrays)
+        for name, kind in HEADS.items():
+            if name in header:
+                return _build_heads(kind, header[name], environment, header, arrays)
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
@@ -220,16 +279,25 @@ def _build_machine_policy(environment: Environment, header: Recipe, arrays: Arra
     return MachinePolicy(str(header["agent"]), environment, hierarchy, Rules(**header["rules"]), tables, seeds)
 
 
-def _build_united_policy(environment: Environment, header: Recipe, arrays: Arrays) -> UnitedPolicy:
-    recipe, seeds = header["united"], tuple(int(seed) for seed in header["seeds"])
-    for_options = tuple(task_named(environment, name) for name in recipe["tasks"])
-    shape, shared, cap = _build_shape(recipe["shape"]), recipe["shared"], int(recipe["option_cap"])
-    template = united_template(environment, len(for_options), shape, shared, len(seeds))
-    return UnitedPolicy(
+def _build_heads(
+    kind: _Heads, recipe: Recipe, environment: Environment, header: Recipe, arrays: Arrays
+) -> UnitedPolicy | GoalPolicy:
+    seeds = tuple(int(seed) for seed in header["seeds"])
+    known = {task.name: task for task in kind.ready_made(environment)}
+    for name in recipe["tasks"]:
+        check_name("task", name, tuple(known))
+    chosen = tuple(known[name] for name in recipe["tasks"])
+    shape, shared = _build_shape(recipe["shape"]), recipe["shared"]
+    seen = observation_shape(environment)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), len(seeds)))
+    template = jax.eval_shape(
+        jax.vmap(lambda key: kind.init(shape, shared, seen, environment.num_actions, len(chosen), key)), keys
+    )
+    return kind.policy(
         agent=str(header["agent"]),
         environment=environment,
-        tasks=for_options,
-        option_cap=cap,
+        tasks=chosen,
+        option_cap=int(recipe["option_cap"]),
         rules=Rules(**header["rules"]),
         shape=shape,
         shared=shared,
@@ -237,14 +305,6 @@ def _build_united_policy(environment: Environment, header: Recipe, arrays: Array
         reward_scale=float(header["reward_scale"]),
         seeds=seeds,
     )
-
-
-def united_template(
-    environment: Environment, num_options: int, shape: NetworkConfig, shared: Shared, count: int
-) -> UnitedNetwork:
-    """Shapes and dtypes of `count` stacked united networks for this environment's observations."""
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
-    return jax.eval_shape(jax.vmap(lambda key: init_for(environment, num_options, shape, shared, key)), keys)
 
 
 def save_options(path: Path, options: Options, environment: Environment) -> None:
@@ -366,10 +426,9 @@ WIDTHS = ("kernels", "strides", "channels", "hidden")
 
 def _network_template(recipe: Recipe, environment: Environment, outputs: int, count: int) -> QNetwork:
     """Shapes and dtypes of `count` stacked networks for this environment's observations."""
-    config = _build_shape(recipe)
-    observation = jax.eval_shape(environment.observe, example_state(environment))
+    config, seen = _build_shape(recipe), observation_shape(environment)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
-    return jax.eval_shape(jax.vmap(lambda key: init_q_network(config, observation.shape, outputs, key)), keys)
+    return jax.eval_shape(jax.vmap(lambda key: init_q_network(config, seen, outputs, key)), keys)
 
 
 def _named_arrays(tree: PyTree, prefix: str) -> Arrays:

@@ -13,12 +13,13 @@ from jaxtyping import PyTree
 
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
+from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.saved import AnyPolicy, MachinePolicy, Policy, UnitedPolicy, united_template
+from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, Policy, UnitedPolicy
 from lodestone.agents.united import UnitedConfig, united
-from lodestone.envs.base import Environment
+from lodestone.envs.base import Environment, observation_shape
 from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig
 from lodestone.learning.history import History
@@ -29,6 +30,7 @@ from lodestone.machines.catalogue import machines
 from lodestone.machines.configurations import configurations
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Options
+from lodestone.options.catalogue import goals as ready_made_goals
 from lodestone.options.catalogue import tasks as ready_made_tasks
 from lodestone.options.execution import Rules
 from lodestone.planning.joint import joint_process
@@ -36,11 +38,12 @@ from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.task_graph import TaskGraph, tabulate_tasks
 
-AgentConfig = DQNConfig | UnitedConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
+AgentConfig = DQNConfig | UnitedConfig | HDQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
 
 AGENTS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
     "united": UnitedConfig,
+    "hdqn": HDQNConfig,
     "q-learning": QLearningConfig,
     "intra-option": IntraOptionConfig,
     "maxq": MAXQConfig,
@@ -66,12 +69,13 @@ def train_policy(
     tasks: Sequence[Task] | None = None,
     start: UnitedPolicy | None = None,
 ) -> tuple[AnyPolicy, History]:
-    """Train all seeds at once for `length` decisions each (tabular agents and united networks: primitive steps).
+    """Train all seeds at once for `length` decisions each (tabular agents, united networks and h-DQN: primitive steps).
 
-    HAMQ learns in `hierarchy`, MAXQ in `graph`, and a united network the options that `tasks` are for (default: what
-    the environment has ready-made); their `options` must be the primitive actions. What MAXQ leaves is the policy that
-    asks anew from the root down at every step. A united network starts as that of `start`, the first seed as its first
-    one and so on, in turn; it may have been trained on another grid if its shape has `pooling`.
+    HAMQ learns in `hierarchy`, MAXQ in `graph`, a united network the options that `tasks` are for, and h-DQN to choose
+    among `tasks` as its goals (default: what the environment has ready-made); their `options` must be the primitive
+    actions. What MAXQ leaves is the policy that asks anew from the root down at every step. A united network starts as
+    that of `start`, the first seed as its first one and so on, in turn; it may have been trained on another grid if its
+    shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
@@ -79,8 +83,8 @@ def train_policy(
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
     if isinstance(config, HAMQConfig):
         hierarchy = hierarchy or machines(environment)
-    if isinstance(config, UnitedConfig):
-        tasks = tuple(ready_made_tasks(environment) if tasks is None else tasks)
+    if isinstance(config, UnitedConfig | HDQNConfig):
+        tasks = _tasks_for(config, environment, tasks)
     plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks, start)
     history = History(len(seeds), plan.choices)
     given = () if start is None else (_in_turn(start, len(seeds)),)
@@ -94,14 +98,15 @@ def train_policy(
     if isinstance(config, HAMQConfig):
         assert hierarchy is not None
         return MachinePolicy(name, environment, hierarchy, rules, learned, tuple(seeds)), history
-    if isinstance(config, UnitedConfig):
+    if isinstance(config, UnitedConfig | HDQNConfig):
         assert tasks is not None
+        united_or_goals = UnitedPolicy if isinstance(config, UnitedConfig) else GoalPolicy
         return (
-            UnitedPolicy(
+            united_or_goals(
                 agent=name,
                 environment=environment,
                 tasks=tuple(tasks),
-                option_cap=config.max_option_steps,
+                option_cap=config.max_option_steps if isinstance(config, UnitedConfig) else config.goal_cap,
                 rules=rules,
                 shape=config.network,
                 shared=config.shared,
@@ -160,15 +165,22 @@ def _plan(
             )
         case UnitedConfig():
             _refuse_options("A united network", options, environment)
-            tasks = ready_made_tasks(environment) if tasks is None else tasks
-            if not tasks:
-                raise InvalidConfig("A united network learns options by their tasks, and this environment has none.")
+            tasks = _tasks_for(config, environment, tasks)
             _check_start(config, environment, tasks, start)
             return _Plan(
                 algorithm=united(config, environment, tasks, rules, length),
                 rounds=config.rounds(length),
                 of_carry=lambda carry: carry.learner.network,
                 choices=choices(tasks),
+            )
+        case HDQNConfig():
+            _refuse_options("h-DQN", options, environment)
+            tasks = _tasks_for(config, environment, tasks)
+            return _Plan(
+                algorithm=hdqn(config, environment, tasks, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.learner.network,
+                choices=tuple(task.name for task in tasks),
             )
         case QLearningConfig():
             return _tables(q_learning(config, environment, options, rules, length), options, length)
@@ -200,6 +212,19 @@ def _plan(
             )
 
 
+def _tasks_for(
+    config: UnitedConfig | HDQNConfig, environment: Environment, tasks: Sequence[Task] | None
+) -> tuple[Task, ...]:
+    """The given ones, or the ready-made ones. Raises `InvalidConfig` where there are none."""
+    of_options = isinstance(config, UnitedConfig)
+    if tasks is None:
+        tasks = ready_made_tasks(environment) if of_options else ready_made_goals(environment)
+    if not tasks:
+        needs = "A united network learns options by their tasks" if of_options else "h-DQN chooses among goals"
+        raise InvalidConfig(f"{needs}, and this environment has none.")
+    return tuple(tasks)
+
+
 def _check_start(
     config: UnitedConfig, environment: Environment, tasks: Sequence[Task], start: UnitedPolicy | None
 ) -> None:
@@ -219,10 +244,13 @@ def _check_start(
             f"The network to start from is {start.shape} and shares {start.shared!r}, but the new one would be "
             f"{config.network} and share {config.shared!r}; they have to be the same."
         )
-    wanted = united_template(environment, len(tasks), config.network, config.shared, len(start.seeds))
-    if jax.tree.map(jnp.shape, start.networks) != jax.tree.map(jnp.shape, wanted):
+    seen, seen_before = observation_shape(environment), observation_shape(start.environment)
+    if config.network.pooling:
+        seen, seen_before = seen[2:], seen_before[2:]
+    if seen != seen_before:
         raise InvalidConfig(
-            "The network to start from was trained on pictures of another size; only one with pooling fits several."
+            "The network to start from was trained on observations of another shape; only one with pooling fits "
+            "pictures of several sizes."
         )
 
 

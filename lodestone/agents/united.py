@@ -29,7 +29,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray, UInt32
 
-from lodestone.envs.base import Environment, example_state, initial_state, inverse_cdf, next_step
+from lodestone.envs.base import (
+    Environment,
+    example_state,
+    initial_state,
+    inverse_cdf,
+    next_step,
+    observation_shape,
+)
 from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig, check_name
 from lodestone.learning.adam import adam_step, start_adam
@@ -356,14 +363,6 @@ def _concatenate(*states: State) -> State:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
 
 
-def init_for(
-    environment: Environment, num_options: int, shape: NetworkConfig, shared: Shared, key: PRNGKeyArray
-) -> UnitedNetwork:
-    """A network at random for what an environment shows. Raises what `init_united_network` raises."""
-    seen = jax.eval_shape(environment.observe, example_state(environment)).shape
-    return init_united_network(shape, shared, seen, environment.num_actions, num_options, key)
-
-
 def update(
     config: UnitedConfig,
     stage: Stage,
@@ -413,7 +412,8 @@ def united(
         network_key, actor_key, key = jax.random.split(key, 3)
         state = example_state(environment)
         if start is None:
-            start = init_for(environment, len(options), config.network, config.shared, network_key)
+            seen, actions = observation_shape(environment), environment.num_actions
+            start = init_united_network(config.network, config.shared, seen, actions, len(options), network_key)
         real, whole = jnp.float32(0), jnp.int32(0)
         everything = jnp.zeros(len(options) + 1, dtype=bool)
         transition = Transition(state, whole, real, real, state, everything)

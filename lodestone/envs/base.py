@@ -139,3 +139,8 @@ def example_state(environment: Environment) -> State:
     """The first of the initial states: an example for shapes and dtypes."""
     _, states = environment.initial_distribution()
     return jax.tree.map(lambda leaf: leaf[0], states)
+
+
+def observation_shape(environment: Environment) -> tuple[int, ...]:
+    """Of what the agent sees."""
+    return jax.eval_shape(environment.observe, example_state(environment)).shape

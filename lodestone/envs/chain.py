@@ -6,6 +6,7 @@ the state says whether the far end was visited, so that the process is Markov.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lodestone.envs.base import Environment
 from lodestone.envs.state_space import reachable_states
+from lodestone.envs.task import Task, goal
 from lodestone.errors import InvalidConfig
 
 LEFT, RIGHT = range(2)
@@ -121,6 +123,23 @@ class Chain(Environment):
         flag = [(pole, top), (pole + SPACE * 2 // 5, top + SPACE // 6), (pole, top + SPACE // 3)]
         draw.polygon(flag, GREEN if visited else PAPER, INK, SMOOTH)
         return np.asarray(picture.reduce(SMOOTH))
+
+
+@dataclass(frozen=True)
+class At:
+    """The agent is at a position, counted from 1."""
+
+    position: int
+
+    def __call__(self, chain: Chain, state: ChainState) -> Bool[Array, ""]:
+        del chain
+        return state.position == self.position
+
+
+def position_goals(chain: Chain) -> tuple[Task, ...]:
+    """One goal for each position but the start's (Kulkarni et al. 2016)."""
+    others = (position for position in range(1, chain.length + 1) if position != chain.start)
+    return tuple(goal(chain, f"to-{position}", At(position)) for position in others)
 
 
 SMOOTH = 3

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import cache, partial
 from typing import Literal, NamedTuple
 
@@ -25,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt, UInt8
 
 from lodestone.envs.base import Environment
 from lodestone.envs.state_space import reachable_states
-from lodestone.envs.task import Task
+from lodestone.envs.task import Task, goal
 from lodestone.errors import InvalidConfig
 
 LEFT, UP, RIGHT, DOWN, MAGNET_ON, MAGNET_OFF = range(6)
@@ -314,3 +315,37 @@ def go_down_task(arm: MagnetArm) -> Task:
 def lift_task(arm: MagnetArm) -> Task:
     """Go down, take a brick and lift it to the top: the training environment of the paper's second option."""
     return Task(arm, "lift", random_layouts, arm_has_lifted, _pay_for_lifting)
+
+
+@dataclass(frozen=True)
+class Holds:
+    """A brick hangs on the arm, and the highest tower in the other columns has exactly the given height."""
+
+    height: int
+
+    def __call__(self, arm: MagnetArm, state: ArmState) -> Bool[Array, ""]:
+        here = jnp.arange(arm.columns) == state.column.astype(jnp.int32)
+        below = 1 << (arm.rows - 1 - state.row.astype(jnp.int32)) >> 1
+        hangs = state.magnet & jnp.any(here & ((state.bricks.astype(jnp.int32) & below) != 0))
+        return hangs & (jnp.max(jnp.where(here, 0, tower_heights(state))) == self.height)
+
+
+@dataclass(frozen=True)
+class Stands:
+    """The magnet is off, and the highest tower has exactly the given height."""
+
+    height: int
+
+    def __call__(self, arm: MagnetArm, state: ArmState) -> Bool[Array, ""]:
+        del arm
+        return (jnp.max(tower_heights(state)) == self.height) & ~state.magnet
+
+
+def tower_goals(arm: MagnetArm) -> tuple[Task, ...]:
+    """Brick by brick: for each height from 2 to the wanted one, hold a brick beside a tower that lacks one, and let
+    the higher tower stand."""
+    goals: list[Task] = []
+    for height in range(2, arm.tower_height + 1):
+        goals.append(goal(arm, f"hold-{height}", Holds(height - 1)))
+        goals.append(goal(arm, f"tower-{height}", Stands(height)))
+    return tuple(goals)

@@ -8,6 +8,7 @@ tasks of the same kind, and read the environment's parameters.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -58,6 +59,25 @@ class Task(Environment):
 
     def render(self, state: State) -> UInt8[np.ndarray, "height width 3"]:
         return self.environment.render(state)
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A task's reward: 1 on arrival where `holds`, else 0."""
+
+    holds: Callable[..., Bool[Array, ""]]
+    """holds(environment, state)."""
+
+    def __call__(
+        self, environment: Environment, state: State, action: Int[Array, ""], next_state: State
+    ) -> Float[Array, ""]:
+        del state, action
+        return self.holds(environment, next_state).astype(jnp.float32)
+
+
+def goal(environment: Environment, name: str, holds: Callable[..., Bool[Array, ""]]) -> Task:
+    """The task of getting where `holds`: it begins as the environment does and pays 1 on arrival."""
+    return Task(environment, name, _as_before, holds, Arrival(holds))
 
 
 def endless(environment: Environment) -> Task:

@@ -10,6 +10,7 @@ from lodestone.errors import check_name
 from lodestone.experiments import (
     discovery,
     hallways,
+    hdqn,
     machines,
     option_usage,
     taxi,
@@ -22,6 +23,7 @@ from lodestone.experiments.study import Experiment
 _ALL: tuple[Experiment, ...] = (
     discovery.EXPERIMENT,
     hallways.EXPERIMENT,
+    hdqn.EXPERIMENT,
     machines.EXPERIMENT,
     option_usage.EXPERIMENT,
     taxi.EXPERIMENT,

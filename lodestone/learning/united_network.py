@@ -7,6 +7,7 @@ manager head over n + 1 choices: one step of the basic policy, or an option.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple, get_args
 
@@ -107,6 +108,28 @@ def init_united_network(
 
     Raises `InvalidConfig` if convolutions are asked for where observations are no pictures, and `UnknownName`.
     """
+    outputs = [num_options + 1, *[num_actions] * (num_options + 1), *[2] * num_options]
+    trunk, heads = init_trunk_and_heads(config, shared, observation_shape, outputs, key)
+    policies, terminations = heads[1 : num_options + 2], heads[num_options + 2 :]
+    return UnitedNetwork(
+        trunk=trunk,
+        manager=heads[0],
+        policies=stack_heads(policies),
+        terminations=stack_heads(terminations) if terminations else _none_of(heads[0]),
+    )
+
+
+def init_trunk_and_heads(
+    config: NetworkConfig,
+    shared: Shared,
+    observation_shape: tuple[int, ...],
+    outputs: Sequence[int],
+    key: PRNGKeyArray,
+) -> tuple[Trunk | None, list[QNetwork]]:
+    """What the heads share, and one head for each number of outputs, with Glorot-uniform weights and zero biases.
+
+    Raises `InvalidConfig` if convolutions are asked for where observations are no pictures, and `UnknownName`.
+    """
     check_name("part to share", shared, get_args(Shared))
     deep = len(config.kernels)
     split = {"nothing": 0, "convolutions": deep, "hidden": deep + len(config.hidden)}[shared]
@@ -115,7 +138,6 @@ def init_united_network(
     of_trunk = replace(config, hidden=config.hidden[: max(0, split - deep)])
     of_head = config if split == 0 else NetworkConfig((), (), (), config.hidden[max(0, split - deep) :])
 
-    outputs = [num_options + 1, *[num_actions] * (num_options + 1), *[2] * num_options]
     shapes = [weight_shapes(config, observation_shape, count) for count in outputs]
     drawn = iter(draw_weights(key, [*shapes[0][:split], *(shape for head in shapes for shape in head[split:])]))
 
@@ -125,16 +147,11 @@ def init_united_network(
     trunk = Trunk(*build_layers(of_trunk, take(split)), config.pooling) if split else None
     per_head = len(shapes[0]) - split
     heads = [QNetwork(*build_layers(of_head, take(per_head)), of_head.pooling) for _ in outputs]
-    policies, terminations = heads[1 : num_options + 2], heads[num_options + 2 :]
-    return UnitedNetwork(
-        trunk=trunk,
-        manager=heads[0],
-        policies=_stack(policies),
-        terminations=_stack(terminations) if terminations else _none_of(heads[0]),
-    )
+    return trunk, heads
 
 
-def _stack(heads: list[QNetwork]) -> QNetwork:
+def stack_heads(heads: Sequence[QNetwork]) -> QNetwork:
+    """Heads of one shape as one, whose arrays have a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *heads)
 
 

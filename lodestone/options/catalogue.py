@@ -1,12 +1,13 @@
-"""What ready-made options and training tasks each environment has, by name."""
+"""What ready-made options, training tasks and goals each environment has, by name."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from lodestone.envs.base import Environment
+from lodestone.envs.chain import Chain, position_goals
 from lodestone.envs.four_rooms import FourRooms
-from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
+from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task, tower_goals
 from lodestone.envs.task import Task
 from lodestone.errors import check_name
 from lodestone.options.base import Options
@@ -27,6 +28,13 @@ def scripts(environment: Environment) -> tuple[Script, ...]:
 def tasks(environment: Environment) -> tuple[Task, ...]:
     """The training tasks for an environment's options; none if there are none."""
     return (go_down_task(environment), lift_task(environment)) if isinstance(environment, MagnetArm) else ()
+
+
+def goals(environment: Environment) -> tuple[Task, ...]:
+    """The goals for an environment's controller; none if there are none."""
+    if isinstance(environment, Chain):
+        return position_goals(environment)
+    return tower_goals(environment) if isinstance(environment, MagnetArm) else ()
 
 
 def option_names(environment: Environment) -> tuple[str, ...]:

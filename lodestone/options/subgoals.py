@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import NO_CAP
 from lodestone.options.tabular import TabularOptions
@@ -32,6 +34,13 @@ class Subgoal(NamedTuple):
     """g: what it is worth to stop in a state; read outside the region and in terminal states only."""
     pays_reward: bool = False
     """Whether the option gets the rewards of the process, too."""
+
+
+def arrival(tables: Tables, goal: Task, discount: float) -> Subgoal:
+    """The sub-goal of getting where a task is over, from everywhere else: the step that arrives pays 1, nothing else
+    pays."""
+    holds = np.asarray(jax.vmap(goal.terminal)(tables.space.states))
+    return Subgoal(goal.name, ~holds, np.where(holds, 1 / discount, 0.0))
 
 
 def subproblem(tables: Tables, subgoal: Subgoal, discount: float) -> Tables:

@@ -8,17 +8,26 @@ import jax
 import numpy as np
 import pytest
 
-from lodestone.agents.saved import Policy, UnitedPolicy, load_options, load_policy, save_options, save_policy
+from lodestone.agents.saved import (
+    GoalPolicy,
+    Policy,
+    UnitedPolicy,
+    load_options,
+    load_policy,
+    save_options,
+    save_policy,
+)
 from lodestone.envs.base import example_state
 from lodestone.envs.magnet_arm import MagnetArm, arm_is_down, go_down_task, random_layouts
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Task
 from lodestone.errors import BadFile, InvalidConfig
 from lodestone.files import read_arrays, write_arrays
+from lodestone.learning.goal_network import init_goal_network
 from lodestone.learning.networks import NetworkConfig, init_q_network
 from lodestone.learning.united_network import init_united_network
 from lodestone.options.base import Capped, Primitives, Union
-from lodestone.options.catalogue import scripted_options, tasks
+from lodestone.options.catalogue import goals, scripted_options, tasks
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.options.tabular import as_tabular
@@ -66,31 +75,53 @@ def test_a_table_comes_back(tmp_path):
     np.testing.assert_array_equal(found.values(1)(example_state(ARM)), table[1, 0])
 
 
-def united_policy(for_options) -> UnitedPolicy:
-    shape = NetworkConfig(kernels=(3,), strides=(3,), channels=(4,), hidden=(8,))
+def policy_with_heads(kind, for_tasks) -> UnitedPolicy | GoalPolicy:
+    init = {UnitedPolicy: init_united_network, GoalPolicy: init_goal_network}[kind]
     keys = jax.random.split(jax.random.key(0), 2)
-    networks = jax.vmap(lambda key: init_united_network(shape, "hidden", (12, 9, 3), 6, len(for_options), key))(keys)
-    rules = Rules(decision_limit=50)
-    return UnitedPolicy("united", ARM, for_options, 5, rules, shape, "hidden", networks, 0.1, (4, 5))
+    made = jax.vmap(lambda key: init(SMALL, "hidden", (12, 9, 3), 6, len(for_tasks), key))(keys)
+    return kind("agent", ARM, for_tasks, 5, Rules(decision_limit=50), SMALL, "hidden", made, 0.1, (4, 5))
 
 
-def test_a_united_network_comes_back(tmp_path):
-    policy = united_policy(tasks(ARM))
+HEADS = [(UnitedPolicy, tasks(ARM)), (GoalPolicy, goals(ARM))]
+
+
+@pytest.mark.parametrize(("kind", "for_tasks"), HEADS)
+def test_networks_of_heads_come_back(kind, for_tasks, tmp_path):
+    policy = policy_with_heads(kind, for_tasks)
     save_policy(tmp_path / "policy.safetensors", policy)
     found = load_policy(tmp_path / "policy.safetensors")
+    assert isinstance(found, kind)
     for name in ("agent", "environment", "tasks", "option_cap", "rules", "shape", "shared", "reward_scale", "seeds"):
         assert getattr(found, name) == getattr(policy, name)
-    state = reachable_states(ARM).state(17)
-    for a, b in zip(found.network(1)(ARM.observe(state)), policy.network(1)(ARM.observe(state)), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert found.options(1).names == ("basic policy", "go-down", "lift")
-    assert found.options(1).max_steps == (1, 5, 5)
+    jax.tree.map(np.testing.assert_array_equal, found.network(1), policy.network(1))
+    assert found.options(1).names == policy.choices
+    assert set(found.options(1).max_steps[1:]) == {5}
 
 
-def test_a_united_network_for_tasks_of_ones_own_is_not_saved(tmp_path):
+@pytest.mark.parametrize("kind", [UnitedPolicy, GoalPolicy])
+def test_networks_for_tasks_of_ones_own_are_not_saved(kind, tmp_path):
     own = Task(ARM, "own", random_layouts, arm_is_down, go_down_task(ARM).pay)
-    with pytest.raises(InvalidConfig, match="ready-made tasks"):
-        save_policy(tmp_path / "policy.safetensors", united_policy((own,)))
+    with pytest.raises(InvalidConfig, match="ready-made tasks or goals"):
+        save_policy(tmp_path / "policy.safetensors", policy_with_heads(kind, (own,)))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"tasks": ["moon"]}, {"tasks": []}, {"option_cap": "x"}, {"shared": "all"}, {"shape": 3}, {"tasks": 7}]
+)
+@pytest.mark.parametrize(("kind", "for_tasks"), HEADS)
+def test_hostile_recipes_of_heads_are_refused(kind, for_tasks, wrong, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, policy_with_heads(kind, for_tasks))
+    arrays, header = read_arrays(path)
+    name = "united" if kind is UnitedPolicy else "goals"
+    for recipe in (header[name] | wrong, None):
+        write_arrays(path, arrays, header | {name: recipe})
+        with pytest.raises(BadFile):
+            load_policy(path)
+    write_arrays(path, dict(list(arrays.items())[1:]), header)
+    with pytest.raises(BadFile, match="missing"):
+        load_policy(path)
 
 
 def test_values_are_in_units_of_the_environments_reward(policy):

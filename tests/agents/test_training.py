@@ -13,12 +13,14 @@ from united_corridor import CORRIDOR, OPTIONS
 
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
+from lodestone.agents.hdqn import HDQNConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.playing import play, play_many, record
-from lodestone.agents.saved import MachinePolicy, UnitedPolicy, save_policy
+from lodestone.agents.saved import GoalPolicy, MachinePolicy, UnitedPolicy, save_policy
 from lodestone.agents.training import train_policy
 from lodestone.agents.united import UnitedConfig
 from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.task import goal
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import InvalidConfig
 from lodestone.learning.networks import NetworkConfig
@@ -28,6 +30,7 @@ from lodestone.options.execution import Rules
 from lodestone.planning.solve import optimum
 from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph
 
+END = goal(CORRIDOR, "end", type(CORRIDOR).terminal)
 ARM = MagnetArm(rows=3, columns=3, bricks=2, tower_height=2)
 
 
@@ -142,7 +145,24 @@ def test_a_network_that_does_not_fit_is_no_start():
         train_policy(DQNConfig(), CORRIDOR, primitives, Rules(), 100, [0], start=start)
 
 
-def test_a_united_network_needs_tasks():
+@pytest.mark.parametrize("config", [UnitedConfig(), HDQNConfig()])
+def test_a_united_network_needs_tasks_and_hdqn_goals(config):
     rooms = TwoRooms()
     with pytest.raises(InvalidConfig, match="environment has none"):
-        train_policy(UnitedConfig(), rooms, Primitives(rooms.action_names), Rules(), 100, [0])
+        train_policy(config, rooms, Primitives(rooms.action_names), Rules(), 100, [0])
+
+
+def test_hdqn_is_trained_for_goals_of_ones_own():
+    config = HDQNConfig(network=NetworkConfig((), (), (), (32,)), learning_starts=100, max_goal_steps=10)
+    primitives, rules = Primitives(CORRIDOR.action_names), Rules(discount=0.9, step_limit=50)
+    policy, history = train_policy(config, CORRIDOR, primitives, rules, 6000, [0, 1], tasks=(*OPTIONS, END))
+    assert isinstance(policy, GoalPolicy)
+    assert history.choices == policy.choices == ("to-2", "to-4", "end")
+    assert play(policy, jax.random.key(0)).success.all()
+    playback = record(policy, 1, jax.random.key(0), "hdqn")
+    assert playback.option_names == policy.choices
+    assert len(playback.option) == 6  # it walks straight to the end
+    np.testing.assert_array_equal(playback.termination[2], [1, 0, 0])
+    np.testing.assert_array_equal(playback.available[2], [False, True, True])
+    values = policy.network(1).goal_values(CORRIDOR.observe(jnp.int32(0))) / config.reward_scale
+    np.testing.assert_allclose(playback.values[0], values, rtol=1e-5)

@@ -30,6 +30,7 @@ from lodestone.envs.magnet_arm import (
     go_down_task,
     lift_task,
     random_layouts,
+    tower_goals,
     tower_heights,
 )
 from lodestone.envs.state_space import reachable_states
@@ -487,3 +488,26 @@ def test_what_the_tasks_pay(
     after = task.transition(state, jnp.int32(action), jnp.int32(0))
     assert float(task.reward(state, jnp.int32(action), after)) == reward
     assert bool(task.terminal(after)) is over
+
+
+@pytest.mark.parametrize(
+    ("picture", "holding"),
+    [
+        ("m.. ... ... bbb", []),
+        (".M. ... ... bbb", []),  # the magnet touches no brick
+        (".M. .b. ... b.b", ["hold-2"]),
+        ("... ... M.. bbb", ["hold-2"]),  # gripped is held
+        ("... ... m.. bbb", []),
+        ("... m.. b.. b.b", ["tower-2"]),
+        ("... M.. b.. b.b", ["hold-2"]),  # the tower's own top
+        ("..M ..b b.. b..", ["hold-3"]),
+        ("M.. b.. b.. b..", []),
+        ("m.. b.. b.. b..", ["tower-3"]),
+    ],
+)
+def test_goals_go_brick_by_brick(picture, holding):
+    arm, state = world(picture, bricks=3)
+    goals = tower_goals(arm)
+    assert [goal.name for goal in goals] == ["hold-2", "tower-2", "hold-3", "tower-3"]
+    assert [goal.name for goal in goals if goal.terminal(state)] == holding
+    assert bool(goals[-1].terminal(state)) == bool(arm.terminal(state))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from lodestone.agents.saved import UnitedPolicy
-from lodestone.agents.united import init_for
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.experiments import transfer
 from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.progress import Silent
+from lodestone.learning.united_network import init_united_network
 from lodestone.options.catalogue import tasks
 from lodestone.options.execution import Rules
 
@@ -81,7 +81,8 @@ def test_a_short_run_judges_everywhere_and_learns_in_every_way(monkeypatch):
 
 
 def test_networks_at_random_fail_everywhere():
-    networks = jax.vmap(lambda key: init_for(LARGE, 2, SHAPE, "hidden", key))(jax.random.split(jax.random.key(0), 2))
+    keys = jax.random.split(jax.random.key(0), 2)
+    networks = jax.vmap(lambda key: init_united_network(SHAPE, "hidden", (4, 3, 4), 6, 2, key))(keys)
     policy = UnitedPolicy("united", LARGE, tasks(LARGE), 21, Rules(), SHAPE, "hidden", networks, 1.0, (0, 1))
     judged = transfer._judge(policy, LARGE)
     assert judged.options.max() < 0.5
