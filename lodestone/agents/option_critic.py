@@ -171,7 +171,8 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
     for switch, needed in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
         if getattr(rules, switch) != needed:
             raise InvalidConfig(f"{switch} is {getattr(rules, switch)}, but option-critic learns from single steps.")
-    needed = needed_chance(world)
+    # Options draw their actions and their ends.
+    needed = tuple(Chance(True, True, world.num_outcomes > 1, len(world.initial_states) > 1))
     everything = jnp.ones(config.num_options, dtype=bool)
 
     def options_of(learned: Learned) -> SoftOptions:
@@ -232,9 +233,3 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
         return Carry(learned, actor, key), log_round(decisions, jnp.mean(losses))
 
     return Algorithm(init, run_round)
-
-
-def needed_chance(world: Enumerated) -> tuple[bool, ...]:
-    """For each field of `Chance`, whether a tick needs it: options draw their actions and their ends."""
-    needed = Chance(True, True, world.num_outcomes > 1, len(world.initial_states) > 1)
-    return tuple(needed)

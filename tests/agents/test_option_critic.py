@@ -19,7 +19,6 @@ from lodestone.agents.option_critic import (
     chosen_value,
     improve_policy,
     improve_termination,
-    needed_chance,
     option_critic,
 )
 from lodestone.agents.q_learning import STEPS_PER_ROUND
