@@ -4,10 +4,20 @@ from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig
+from lodestone.agents.option_critic import OptionCriticConfig
 from lodestone.agents.playing import Playback, play, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.q_learning import QLearningConfig
-from lodestone.agents.saved import MachinePolicy, Policy, load_options, load_policy, save_options, save_policy
+from lodestone.agents.sarsa import SarsaConfig
+from lodestone.agents.saved import (
+    MachinePolicy,
+    OptionCriticPolicy,
+    Policy,
+    load_options,
+    load_policy,
+    save_options,
+    save_policy,
+)
 from lodestone.agents.training import train_policy
 from lodestone.devices import use_all_cores
 from lodestone.discovery.betweenness import BetweennessConfig
@@ -61,6 +71,8 @@ __all__ = [
     "MachinePolicy",
     "MagnetArm",
     "NetworkConfig",
+    "OptionCriticConfig",
+    "OptionCriticPolicy",
     "Options",
     "Playback",
     "Policy",
@@ -69,6 +81,7 @@ __all__ = [
     "RandomMDP",
     "Recording",
     "Rules",
+    "SarsaConfig",
     "Script",
     "Scripted",
     "Subgoal",

@@ -243,6 +243,8 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("hamq", ["magnet-arm", *TINY], "20000"),
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
+        ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
+        ("sarsa", ["four-rooms", "--dynamics", "deterministic"], "60000"),
     ],
 )
 def test_hierarchies_are_trained_saved_and_watched(agent, environment, steps, capsys, tmp_path):
@@ -266,7 +268,7 @@ REFUSED = [
     (["nonsense"], "no command named 'nonsense'"),
     (["plan"], "needs the name of an environment"),
     (["plan", "moon"], "no environment named 'moon'"),
-    (["train", "sarsa", "magnet-arm"], "no agent named 'sarsa'"),
+    (["train", "reinforce", "magnet-arm"], "no agent named 'reinforce'"),
     (["train", "dqn"], "needs the name of an environment"),
     (["plan", "magnet-arm", "--bricks", "99"], "99 bricks do not fit"),
     (["plan", "magnet-arm", "--tower-height", "4"], "allow a tower of at most"),
@@ -289,6 +291,9 @@ REFUSED = [
     (["train", "hamq", "chain", "--out", "run"], "no ready-made machines for chain"),
     (["train", "hamq", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "united", "magnet-arm", "--options", "lift"], "takes no options"),
+    (["train", "option-critic", "four-rooms", "--options", "hallways"], "takes no options"),
+    (["train", "option-critic", "four-rooms", "--call-cost", "0.5"], "call_cost is 0.5"),
+    (["train", "option-critic", "four-rooms", "--temperature", "0"], "temperature is 0"),
     (["train", "united", "taxi"], "this environment has none"),
     (["train", "united", "magnet-arm", "--option-cap", "5"], "option_cap is given, but no options are"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),

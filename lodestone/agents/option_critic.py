@@ -30,7 +30,7 @@ from lodestone.envs.state_space import Numbers
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import Actor, Chance, Rules, deal, start_actor, tick, uniforms
+from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.soft import SoftOptions
 from lodestone.planning.enumerated import Enumerated, enumerated, look_up_step
 from lodestone.planning.tables import tabulate
@@ -61,8 +61,8 @@ class OptionCriticConfig:
     """What the critic takes a choice anew to be worth. `greedy`: the best option, as in intra-option Q-learning.
     `on-policy`: the option that the policy over options chooses, in the mean."""
     order: Order = "theorem"
-    """`theorem`: as above. `authors`: as in the authors' code, where on arrival in s' the coin is tossed first, and policy
-    and termination are updated for the option that acts next and its action, before that action's reward is known."""
+    """`theorem`: as above. `authors`: as in the authors' code, where on arrival in s' the coin is tossed first, and the
+    policy and termination of the option that acts next are updated there, before its action's reward is known."""
 
     def __post_init__(self) -> None:
         if self.num_options < 1:
@@ -81,7 +81,7 @@ class OptionCriticConfig:
 
 
 class Learned(NamedTuple):
-    """What is learned about O options over S states and A actions; all of it starts at zero."""
+    """What is learned about O options over S states and A actions."""
 
     table: Float[Array, "S O"]
     """Q."""
@@ -91,6 +91,12 @@ class Learned(NamedTuple):
     """theta."""
     exits: Float[Array, "S O"]
     """vartheta."""
+
+
+def nothing_learned(shape: tuple[int, ...], num_actions: int) -> Learned:
+    """Zeros for [S, O] pairs, or for several seeds of them."""
+    of_actions = jnp.zeros((*shape, num_actions))
+    return Learned(jnp.zeros(shape), of_actions, of_actions, jnp.zeros(shape))
 
 
 class Carry(NamedTuple):
@@ -168,11 +174,11 @@ def option_critic(config: OptionCriticConfig, environment: Environment, rules: R
 
 def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rules: Rules, steps: int) -> Algorithm:
     """The same in a world of numbered states."""
-    for switch, needed in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
-        if getattr(rules, switch) != needed:
+    for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
+        if getattr(rules, switch) != wanted:
             raise InvalidConfig(f"{switch} is {getattr(rules, switch)}, but option-critic learns from single steps.")
-    # Options draw their actions and their ends.
-    needed = tuple(Chance(True, True, world.num_outcomes > 1, len(world.initial_states) > 1))
+    # The fields of `Chance`: options draw their actions and their ends.
+    needed = (True, True, world.num_outcomes > 1, len(world.initial_states) > 1)
     everything = jnp.ones(config.num_options, dtype=bool)
 
     def options_of(learned: Learned) -> SoftOptions:
@@ -180,9 +186,7 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        shape = (world.ends.size, config.num_options)
-        by_action = jnp.zeros((*shape, world.num_actions))
-        learned = Learned(jnp.zeros(shape), by_action, by_action, jnp.zeros(shape))
+        learned = nothing_learned((world.ends.size, config.num_options), world.num_actions)
         return Carry(learned, start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
@@ -210,15 +214,11 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
 
             if config.order == "authors":
                 on_the_way = actor.episode_steps > 0
-                learned = improve_policy(
-                    learned, state, option, action, probs, jnp.where(on_the_way, policy_rate, 0.0)
-                )
+                learned = improve_policy(learned, state, option, action, probs, jnp.where(on_the_way, policy_rate, 0.0))
                 learned = improved_termination(learned, state, option, on_the_way)
             next_values = learned.table[arrived.state]
             anew = largest(next_values) if config.critic == "greedy" else chosen_value(next_values, epsilon)
-            learned, loss = improve_critic(
-                learned, state, option, action, arrived, anew, rules.discount, critic_rate
-            )
+            learned, loss = improve_critic(learned, state, option, action, arrived, anew, rules.discount, critic_rate)
             if config.order == "theorem":
                 learned = improve_policy(learned, state, option, action, probs, policy_rate)
                 learned = improved_termination(learned, arrived.state, option, ~arrived.terminated)

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
-from lodestone.agents.saved import AnyPolicy, MachinePolicy, UnitedPolicy
-from lodestone.envs.base import Environment
+from lodestone.agents.saved import AnyPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
 from lodestone.learning.united_execution import play_united, trace_united
 
@@ -64,8 +63,8 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
         if isinstance(policy, UnitedPolicy):
             return play_united(policy.environment, policy.rules, policy.option_cap, learned, key, MAX_STEPS)
-        values = policy.values_of(learned)
-        return play_episode(policy.environment, policy.options, policy.rules, values, key, MAX_STEPS)
+        options = policy.options_of(learned) if isinstance(policy, OptionCriticPolicy) else policy.options
+        return play_episode(policy.environment, options, policy.rules, policy.values_of(learned), key, MAX_STEPS)
 
     @jax.jit
     def run(learned: PyTree) -> Episode:
@@ -74,10 +73,12 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     return jax.tree.map(np.asarray, run(policy.networks if isinstance(policy, UnitedPolicy) else policy.learned))
 
 
-def episodes_to_judge(environment: Environment) -> int:
-    """How many episodes tell what a policy is worth: one in a world without chance that begins in one state."""
+def episodes_to_judge(policy: AnyPolicy) -> int:
+    """How many episodes tell what a policy is worth: one in a world without chance that begins in one state, if its
+    options do not draw their actions."""
+    environment = policy.environment
     alone = environment.num_outcomes == 1 and environment.initial_distribution()[0].shape[0] == 1
-    return 1 if alone else EPISODES
+    return 1 if alone and not isinstance(policy, OptionCriticPolicy) else EPISODES
 
 
 def _of_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> Episode:
@@ -106,6 +107,10 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
         environment, rules = policy.environment, policy.rules
         if isinstance(policy, UnitedPolicy):
             return trace_united(environment, rules, policy.option_cap, policy.network(position), key, length)
+        if isinstance(policy, OptionCriticPolicy):
+            learned = policy.of_seed(position)
+            options, values = policy.options_of(learned), policy.values_of(learned)
+            return trace_episode(environment, options, rules, values, key, length)
         return trace_episode(environment, policy.options, rules, policy.values(position), key, length)
 
     trace = jax.tree.map(np.asarray, run(key))
@@ -114,7 +119,7 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
     return Playback(
         agent=agent,
         seed=policy.seeds[position],
-        option_names=policy.choices if isinstance(policy, UnitedPolicy) else policy.options.names,
+        option_names=policy.options.names if isinstance(policy, Policy) else policy.choices,
         action_names=policy.environment.action_names,
         pictures=np.stack([policy.environment.render(state) for state in states]),
         option=trace.option,

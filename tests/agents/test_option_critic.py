@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,6 @@ from lodestone.agents.option_critic import (
 from lodestone.agents.q_learning import STEPS_PER_ROUND
 from lodestone.envs.random_mdp import RandomMDP
 from lodestone.errors import InvalidConfig
-from lodestone.learning.history import History
 from lodestone.learning.loop import Algorithm, train
 from lodestone.options.base import NO_CAP
 from lodestone.options.execution import Rules, uniforms
@@ -280,7 +278,9 @@ def test_expected_updates_are_the_exact_gradients(seed, goals):
     steps = np.einsum("soa,sax->soax", acting, 0.9 * probs)
 
     with jax.enable_x64(True):
-        learned = Learned(*map(jnp.asarray, (exact.by_option, exact.by_action, parameters.preferences, parameters.exits)))
+        learned = Learned(
+            *map(jnp.asarray, (exact.by_option, exact.by_action, parameters.preferences, parameters.exits))
+        )
         pairs = np.moveaxis(np.indices(acting.shape), 0, -1).reshape(-1, 3)
         drawn = jnp.asarray(parameters.policies[pairs[:, 0], pairs[:, 1]])
         better = jax.vmap(improve_policy, in_axes=(None, 0, 0, 0, 0, 0))(
@@ -288,7 +288,7 @@ def test_expected_updates_are_the_exact_gradients(seed, goals):
         )
         of_policy = (np.asarray(better.preferences) - np.asarray(learned.preferences)).sum(axis=0)
 
-        s, o, a, x = np.moveaxis(np.indices(steps.shape), 0, -1).reshape(-1, 4).T
+        _, o, _, x = np.moveaxis(np.indices(steps.shape), 0, -1).reshape(-1, 4).T
         anew = jax.vmap(chosen_value, in_axes=(0, None))(learned.table[x], epsilon)
         better = jax.vmap(improve_termination, in_axes=(None, 0, 0, 0, None, 0))(
             learned, jnp.asarray(x), jnp.asarray(o), anew, 0.0, jnp.asarray(steps.ravel())

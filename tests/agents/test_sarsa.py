@@ -37,7 +37,10 @@ def test_it_learns_what_its_own_choices_are_worth(everywhere):
     mdp, options = random_mdp(4, goals=1), random_options(4)
     if everywhere:
         options = RandomOptions(jnp.ones_like(options.start), options.acts, options.stops, options.caps)
-    config, rules = SarsaConfig(SETTLING, epsilon=((0.0, 1.0),)), Rules(discount=0.9, step_limit=7 if everywhere else 50)
+    config, rules = (
+        SarsaConfig(SETTLING, epsilon=((0.0, 1.0),)),
+        Rules(discount=0.9, step_limit=7 if everywhere else 50),
+    )
     learned = learn(config, mdp, options, rules, 100_000, seeds=32).mean(axis=0)
     tables = tabulate(mdp)
     described = tabulate_options(options, tables.space)
