@@ -7,13 +7,14 @@ are not in it: they have figures, presets and saved policies of their own.
 from __future__ import annotations
 
 from lodestone.errors import check_name
-from lodestone.experiments import discovery, hallways, machines, taxi, two_rooms, united
+from lodestone.experiments import discovery, hallways, machines, option_critic, taxi, two_rooms, united
 from lodestone.experiments.study import Experiment
 
 _ALL: tuple[Experiment, ...] = (
     discovery.EXPERIMENT,
     hallways.EXPERIMENT,
     machines.EXPERIMENT,
+    option_critic.EXPERIMENT,
     taxi.EXPERIMENT,
     two_rooms.EXPERIMENT,
     united.EXPERIMENT,
