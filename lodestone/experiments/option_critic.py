@@ -81,8 +81,8 @@ class Run(NamedTuple):
     """Episodes that each seed had finished."""
     length: Float[np.ndarray, "C N"]
     """Mean steps of an option since the last look."""
-    share: Float[np.ndarray, "C N"]
-    """Share of the steps under the most used option since then."""
+    shares: Float[np.ndarray, "C N O"]
+    """Share of the steps under each option since then, the most used one first."""
     stops: Float[np.ndarray, "C N"]
     """Mean of beta over cells and options."""
     least_stop: float
@@ -116,9 +116,7 @@ def run(seeds: int, progress: Progress) -> Study:
         seeds=seeds,
         panels=(
             *(_lengths(houses[dynamics], dynamics, runs) for dynamics in DYNAMICS),
-            _over_training("Options' length, code", "steps, mean", "length", runs),
-            _over_training("Terminations, code", "beta, mean of cells and options", "stops", runs),
-            _over_training("Most used option, code", "share of the steps", "share", runs),
+            *_over_training({name: runs["code", name] for name in COLLAPSES}),
         ),
         tables=(*(_numbers(houses[dynamics], dynamics, runs) for dynamics in DYNAMICS), _ends(runs)),
         gates=tuple(_gates(runs)),
@@ -186,21 +184,21 @@ def _learn(house: House, dynamics: Dynamics, name: str, seeds: int, progress: Pr
         usage, finished, moved = history.usage[-1], np.asarray(carry.episodes), np.asarray(carry.moved)
         steps = usage.steps.sum(axis=1)
         stops = np.nan if isinstance(config, SarsaConfig) else _terminations(carry).mean(axis=(1, 2))
-        share = usage.steps.max(axis=1) / np.maximum(steps, 1)
-        looked.append((finished, steps / np.maximum(usage.calls.sum(axis=1), 1), share, np.full(seeds, stops)))
+        shares = np.sort(usage.steps / np.maximum(steps, 1)[:, None], axis=1)[:, ::-1]
+        looked.append((finished, steps / np.maximum(usage.calls.sum(axis=1), 1), shares, np.full(seeds, stops)))
         done = np.where(moved > 0, EPISODES + finished - moved, np.minimum(finished, EPISODES))
         progress.advance(float(min(done.min(), work)), f"{finished.min():,} episodes")
         if done.min() >= work:
             break
     lengths = [history.episodes(seed).length_steps for seed in range(seeds)]
-    finished, length, share, stops = (np.stack(column) for column in zip(*looked, strict=True))
+    finished, length, shares, stops = (np.stack(column) for column in zip(*looked, strict=True))
     moments = _moments(house, config, carry, seeds)
     return Run(
         before=np.stack([steps[:EPISODES] for steps in lengths]),
         after=np.stack([steps[at : at + EPISODES] for steps, at in zip(lengths, moved, strict=True)]),
         finished=finished,
         length=length,
-        share=share,
+        shares=shares,
         stops=stops,
         least_stop=np.nan if isinstance(config, SarsaConfig) else float(_terminations(carry).min()),
         stops_on_arrival=float(np.mean([stop for *_, stop in moments])),
@@ -280,17 +278,27 @@ def _lengths(house: House, dynamics: Dynamics, runs: dict[tuple[Dynamics, str], 
     )
 
 
-def _over_training(title: str, label: str, field: str, runs: dict[tuple[Dynamics, str], Run]) -> Panel:
+def _over_training(runs: dict[str, Run]) -> list[Panel]:
+    """Length and terminations of all options, and how much each of four is used."""
     x = np.linspace(0, 2 * EPISODES, 101)
-    series = []
-    for name in COLLAPSES:
-        one = runs["code", name]
+
+    def series(name: str, one: Run, looked: Float[np.ndarray, "C N"]) -> Series:
         rows = [
             np.insert(values, 0, np.nan)[np.searchsorted(finished, x, side="right")]
-            for finished, values in zip(one.finished.T, getattr(one, field).T, strict=True)
+            for finished, values in zip(one.finished.T, looked.T, strict=True)
         ]
-        series.append(Series(name, x, np.stack(rows)))
-    return Panel(title, "episode", label, tuple(series))
+        return Series(name, x, np.stack(rows))
+
+    lengths = tuple(series(name, one, one.length) for name, one in runs.items())
+    stops = tuple(series(name, one, one.stops) for name, one in runs.items())
+    places = ("most used option", "second", "third", "fourth")
+    four = runs[FOUR]
+    shares = tuple(series(name, four, four.shares[:, :, place]) for place, name in enumerate(places))
+    return [
+        Panel("Length of an option, code", "episode", "steps, mean", lengths),
+        Panel("Terminations, code", "episode", "beta, mean of cells and options", stops),
+        Panel(f"Use of each option, code, {FOUR}", "episode", "share of the steps", shares, y_range=(0.0, 1.0)),
+    ]
 
 
 def _numbers(house: House, dynamics: Dynamics, runs: dict[tuple[Dynamics, str], Run]) -> NumberTable:
@@ -343,7 +351,7 @@ def _ends(runs: dict[tuple[Dynamics, str], Run]) -> NumberTable:
                 one.stops_on_arrival,
                 one.least_stop,
                 float(one.length[-1].mean()),
-                float(one.share[-1].mean()),
+                float(one.shares[-1, :, 0].mean()),
                 float(one.before[:, -LAST:].mean()),
                 float(one.after[:, -LAST:].mean()),
             )

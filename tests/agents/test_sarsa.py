@@ -41,9 +41,10 @@ def test_it_learns_what_its_own_choices_are_worth(everywhere):
         SarsaConfig(SETTLING, epsilon=((0.0, 1.0),)),
         Rules(discount=0.9, step_limit=7 if everywhere else 50),
     )
-    learned = learn(config, mdp, options, rules, 100_000, seeds=32).mean(axis=0)
-    tables = tabulate(mdp)
+    each = learn(config, mdp, options, rules, 100_000, seeds=32)
+    tables, learned = tabulate(mdp), each.mean(axis=0)
     described = tabulate_options(options, tables.space)
+    assert not each[:, ~described.initiation.T].any()
     at_random = described.initiation.T / described.initiation.T.sum(axis=1, keepdims=True)
     exact = evaluate_option_choices(tables, described, at_random, 0.9)
     counted = described.initiation.T & ~tables.terminal[:, None]

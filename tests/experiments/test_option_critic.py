@@ -37,11 +37,13 @@ def test_a_short_run_shows_every_learner(monkeypatch):
         monkeypatch.setattr(option_critic, name, value)
     monkeypatch.setattr(option_critic, "COLLAPSES", (option_critic.FOUR, option_critic.GREEDY))
     study = option_critic.run(2, Silent())
-    assert [len(panel.series) for panel in study.panels] == [4, 2, 2, 2]
+    assert [len(panel.series) for panel in study.panels] == [4, 2, 2, 4]
     assert [len(table.rows) for table in study.tables] == [4, 2]
     for series in study.panels[0].series:
         assert series.seeds.shape == (2, 4)
         assert ((series.seeds >= 1) & (series.seeds <= 1000)).all()
+    shares = np.stack([series.seeds for series in study.panels[-1].series])
+    np.testing.assert_allclose(shares.sum(axis=0)[:, -1], 1.0)
     assert all(np.isfinite(row[1:]).all() for table in study.tables for row in table.rows)
     gaps = np.array([row[5:7] for row in study.tables[0].rows], dtype=float)
     assert ((gaps > 0) & (gaps < 0.93)).all()

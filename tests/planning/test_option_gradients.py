@@ -82,6 +82,7 @@ def test_gradients_are_the_finite_differences(seed, goals, temperature):
     assert np.abs(by_exits).max() > 0.01
     assert not by_preferences[tables.terminal].any()
     assert not by_exits[tables.terminal].any()
+    assert not process.after_a_step(process.running(weights))[tables.terminal].any()
 
 
 @pytest.mark.parametrize("goals", [0, 1])
