@@ -5,12 +5,15 @@ from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.hdqn import HDQNConfig
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig
+from lodestone.agents.option_critic import OptionCriticConfig
 from lodestone.agents.playing import Playback, play, record
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.q_learning import QLearningConfig
+from lodestone.agents.sarsa import SarsaConfig
 from lodestone.agents.saved import (
     GoalPolicy,
     MachinePolicy,
+    OptionCriticPolicy,
     Policy,
     load_options,
     load_policy,
@@ -72,6 +75,8 @@ __all__ = [
     "MachinePolicy",
     "MagnetArm",
     "NetworkConfig",
+    "OptionCriticConfig",
+    "OptionCriticPolicy",
     "Options",
     "Playback",
     "Policy",
@@ -80,6 +85,7 @@ __all__ = [
     "RandomMDP",
     "Recording",
     "Rules",
+    "SarsaConfig",
     "Script",
     "Scripted",
     "Subgoal",

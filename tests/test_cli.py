@@ -245,6 +245,8 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
         ("hdqn", ["magnet-arm", *TINY, *SMALL, "--reward-scale", "0.2", "--discount", "0.97"], "12000"),
+        ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
+        ("sarsa", ["four-rooms", "--dynamics", "deterministic"], "60000"),
     ],
 )
 def test_hierarchies_are_trained_saved_and_watched(agent, environment, steps, capsys, tmp_path):
@@ -268,7 +270,7 @@ REFUSED = [
     (["nonsense"], "no command named 'nonsense'"),
     (["plan"], "needs the name of an environment"),
     (["plan", "moon"], "no environment named 'moon'"),
-    (["train", "sarsa", "magnet-arm"], "no agent named 'sarsa'"),
+    (["train", "reinforce", "magnet-arm"], "no agent named 'reinforce'"),
     (["train", "dqn"], "needs the name of an environment"),
     (["plan", "magnet-arm", "--bricks", "99"], "99 bricks do not fit"),
     (["plan", "magnet-arm", "--tower-height", "4"], "allow a tower of at most"),
@@ -291,6 +293,9 @@ REFUSED = [
     (["train", "hamq", "chain", "--out", "run"], "no ready-made machines for chain"),
     (["train", "hamq", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "united", "magnet-arm", "--options", "lift"], "takes no options"),
+    (["train", "option-critic", "four-rooms", "--options", "hallways"], "takes no options"),
+    (["train", "option-critic", "four-rooms", "--call-cost", "0.5"], "call_cost is 0.5"),
+    (["train", "option-critic", "four-rooms", "--temperature", "0"], "temperature is 0"),
     (["train", "united", "taxi"], "this environment has none"),
     (["train", "hdqn", "taxi", "--out", "run"], "chooses among goals, and this environment has none"),
     (["train", "hdqn", "magnet-arm", "--options", "lift"], "takes no options"),

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
-from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, Policy, UnitedPolicy
-from lodestone.envs.base import Environment
+from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
 from lodestone.learning.united_execution import play_united, trace_united
+from lodestone.options.base import Options
 
 MAX_STEPS = 5000
 """Primitive steps after which an episode is given up where the policy's rules have no limit that ends it sooner."""
@@ -64,20 +64,32 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
         if isinstance(policy, UnitedPolicy):
             return play_united(policy.environment, policy.rules, policy.option_cap, learned, key, MAX_STEPS)
-        options = policy.options_of(learned) if isinstance(policy, GoalPolicy) else policy.options
-        return play_episode(policy.environment, options, policy.rules, policy.values_of(learned), key, MAX_STEPS)
+        options, values = _options(policy, learned), policy.values_of(learned)
+        return play_episode(policy.environment, options, policy.rules, values, key, MAX_STEPS)
 
     @jax.jit
     def run(learned: PyTree) -> Episode:
         return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(learned, keys)
 
-    return jax.tree.map(np.asarray, run(policy.learned if isinstance(policy, Policy) else policy.networks))
+    return jax.tree.map(np.asarray, run(_learned(policy)))
 
 
-def episodes_to_judge(environment: Environment) -> int:
-    """How many episodes tell what a policy is worth: one in a world without chance that begins in one state."""
+def _learned(policy: Policy | UnitedPolicy | GoalPolicy | OptionCriticPolicy) -> PyTree:
+    """What it has learned, with a leading seed axis."""
+    return policy.networks if isinstance(policy, UnitedPolicy | GoalPolicy) else policy.learned
+
+
+def _options(policy: Policy | GoalPolicy | OptionCriticPolicy, learned: PyTree) -> Options:
+    """What one seed chooses from: given, or learned too."""
+    return policy.options if isinstance(policy, Policy) else policy.options_of(learned)
+
+
+def episodes_to_judge(policy: AnyPolicy) -> int:
+    """How many episodes tell what a policy is worth: one in a world without chance that begins in one state, if its
+    options do not draw their actions."""
+    environment = policy.environment
     alone = environment.num_outcomes == 1 and environment.initial_distribution()[0].shape[0] == 1
-    return 1 if alone else EPISODES
+    return 1 if alone and not isinstance(policy, OptionCriticPolicy) else EPISODES
 
 
 def _of_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> Episode:
@@ -104,12 +116,11 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
     @jax.jit
     def run(key: PRNGKeyArray) -> Trace:
         environment, rules = policy.environment, policy.rules
+        learned = jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), _learned(policy))
         if isinstance(policy, UnitedPolicy):
-            return trace_united(environment, rules, policy.option_cap, policy.network(position), key, length)
-        if isinstance(policy, GoalPolicy):
-            values = policy.values_of(policy.network(position))
-            return trace_episode(environment, policy.options(position), rules, values, key, length)
-        return trace_episode(environment, policy.options, rules, policy.values(position), key, length)
+            return trace_united(environment, rules, policy.option_cap, learned, key, length)
+        options, values = _options(policy, learned), policy.values_of(learned)
+        return trace_episode(environment, options, rules, values, key, length)
 
     trace = jax.tree.map(np.asarray, run(key))
     states = [jax.tree.map(lambda leaf, step=step: leaf[step], trace.state) for step in range(length)]

@@ -92,6 +92,8 @@ def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...
     """For each field of `Chance`, whether a tick needs it: drawing them takes a good part of a learner's time."""
 
     def draws(probs: Array) -> bool:
+        if isinstance(probs, jax.core.Tracer):  # of a world that is known only when the program runs
+            return True
         return bool(((np.asarray(probs) > 0) & (np.asarray(probs) < 1)).any())
 
     needed = {

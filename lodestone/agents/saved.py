@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lodestone import __version__
+from lodestone.agents.option_critic import Learned, OptionCriticConfig, nothing_learned
 from lodestone.envs.base import Environment, observation_shape
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
@@ -33,6 +34,7 @@ from lodestone.options.catalogue import goals, scripted_options, task_named, tas
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.options.scripted import Scripted
+from lodestone.options.soft import SoftOptions, numbered_names
 from lodestone.options.tabular import TabularOptions
 from lodestone.planning.joint import JointProcess, joint_process
 from lodestone.types import State
@@ -164,7 +166,41 @@ class GoalPolicy:
         return lambda state: network.goal_values(self.environment.observe(state)) / self.reward_scale
 
 
-AnyPolicy = Policy | MachinePolicy | UnitedPolicy | GoalPolicy
+@dataclass(frozen=True)
+class OptionCriticPolicy:
+    """Options that option-critic has learned with the policy over them, of one or more seeds."""
+
+    agent: str
+    """Name of the algorithm."""
+    environment: Environment
+    rules: Rules
+    temperature: float
+    """Of the options' policies."""
+    learned: Learned
+    """With a leading seed axis."""
+    seeds: tuple[int, ...]
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Names of the options."""
+        return numbered_names(self.learned.table.shape[2])
+
+    def of_seed(self, position: int) -> Learned:
+        """What the seed at this position has learned."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.learned)
+
+    def options_of(self, learned: Learned) -> SoftOptions:
+        """The options of one seed."""
+        space = reachable_states(self.environment)
+        return SoftOptions(space, learned.preferences, learned.exits, self.temperature)
+
+    def values_of(self, learned: Learned) -> Callable[[State], Float[Array, " O"]]:
+        """Q(s, .) of one seed."""
+        space = reachable_states(self.environment)
+        return lambda state: learned.table[space.index_of(state)]
+
+
+AnyPolicy = Policy | MachinePolicy | UnitedPolicy | GoalPolicy | OptionCriticPolicy
 
 
 def save_policy(path: Path, policy: AnyPolicy) -> None:
@@ -174,6 +210,9 @@ def save_policy(path: Path, policy: AnyPolicy) -> None:
         return
     if isinstance(policy, UnitedPolicy | GoalPolicy):
         _save_heads(path, policy)
+        return
+    if isinstance(policy, OptionCriticPolicy):
+        _save_option_critic_policy(path, policy)
         return
     recipe, arrays = _describe_options(policy.options, "options")
     network = _describe_network(policy.learned) if isinstance(policy.learned, QNetwork) else None
@@ -243,6 +282,19 @@ def _save_heads(path: Path, policy: UnitedPolicy | GoalPolicy) -> None:
     write_arrays(path, _named_arrays(policy.networks, "learned"), header)
 
 
+def _save_option_critic_policy(path: Path, policy: OptionCriticPolicy) -> None:
+    header = {
+        "kind": "policy",
+        "version": __version__,
+        "agent": policy.agent,
+        "environment": describe_environment(policy.environment),
+        "option_critic": {"num_options": policy.learned.table.shape[2], "temperature": policy.temperature},
+        "rules": asdict(policy.rules),
+        "seeds": list(policy.seeds),
+    }
+    write_arrays(path, _named_arrays(policy.learned, "learned"), header)
+
+
 def load_policy(path: Path) -> AnyPolicy:
     """Raises `BadFile`."""
     arrays, header = _read(path, "policy")
@@ -254,6 +306,8 @@ def load_policy(path: Path) -> AnyPolicy:
         for name, kind in HEADS.items():
             if name in header:
                 return _build_heads(kind, header[name], environment, header, arrays)
+        if "option_critic" in header:
+            return _build_option_critic_policy(environment, header, arrays)
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
@@ -303,6 +357,20 @@ def _build_heads(
         shared=shared,
         networks=_fill(template, arrays, "learned"),
         reward_scale=float(header["reward_scale"]),
+        seeds=seeds,
+    )
+
+
+def _build_option_critic_policy(environment: Environment, header: Recipe, arrays: Arrays) -> OptionCriticPolicy:
+    config, seeds = OptionCriticConfig(**header["option_critic"]), tuple(int(seed) for seed in header["seeds"])
+    shape = (len(seeds), reachable_states(environment).size, config.num_options)
+    template = jax.eval_shape(lambda: nothing_learned(shape, environment.num_actions))
+    return OptionCriticPolicy(
+        agent=str(header["agent"]),
+        environment=environment,
+        rules=Rules(**header["rules"]),
+        temperature=config.temperature,
+        learned=_fill(template, arrays, "learned"),
         seeds=seeds,
     )
 

@@ -16,8 +16,10 @@ from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
+from lodestone.agents.option_critic import OptionCriticConfig, option_critic
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, Policy, UnitedPolicy
+from lodestone.agents.sarsa import SarsaConfig, sarsa
+from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
 from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment, observation_shape
 from lodestone.envs.task import Task
@@ -33,19 +35,32 @@ from lodestone.options.base import Options
 from lodestone.options.catalogue import goals as ready_made_goals
 from lodestone.options.catalogue import tasks as ready_made_tasks
 from lodestone.options.execution import Rules
+from lodestone.options.soft import numbered_names
 from lodestone.planning.joint import joint_process
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.task_graph import TaskGraph, tabulate_tasks
 
-AgentConfig = DQNConfig | UnitedConfig | HDQNConfig | QLearningConfig | IntraOptionConfig | MAXQConfig | HAMQConfig
+AgentConfig = (
+    DQNConfig
+    | UnitedConfig
+    | HDQNConfig
+    | QLearningConfig
+    | SarsaConfig
+    | IntraOptionConfig
+    | OptionCriticConfig
+    | MAXQConfig
+    | HAMQConfig
+)
 
 AGENTS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
     "united": UnitedConfig,
     "hdqn": HDQNConfig,
     "q-learning": QLearningConfig,
+    "sarsa": SarsaConfig,
     "intra-option": IntraOptionConfig,
+    "option-critic": OptionCriticConfig,
     "maxq": MAXQConfig,
     "hamq": HAMQConfig,
 }
@@ -72,10 +87,10 @@ def train_policy(
     """Train all seeds at once for `length` decisions each (tabular agents, united networks and h-DQN: primitive steps).
 
     HAMQ learns in `hierarchy`, MAXQ in `graph`, a united network the options that `tasks` are for, and h-DQN to choose
-    among `tasks` as its goals (default: what the environment has ready-made); their `options` must be the primitive
-    actions. What MAXQ leaves is the policy that asks anew from the root down at every step. A united network starts as
-    that of `start`, the first seed as its first one and so on, in turn; it may have been trained on another grid if its
-    shape has `pooling`.
+    among `tasks` as its goals (default: what the environment has ready-made); option-critic makes its own: their
+    `options` must be the primitive actions. What MAXQ leaves is the policy that asks anew from the root down at every
+    step. A united network starts as that of `start`, the first seed as its first one and so on, in turn; it may have
+    been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
@@ -116,6 +131,8 @@ def train_policy(
             ),
             history,
         )
+    if isinstance(config, OptionCriticConfig):
+        return OptionCriticPolicy(name, environment, rules, config.temperature, learned, tuple(seeds)), history
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
@@ -184,6 +201,16 @@ def _plan(
             )
         case QLearningConfig():
             return _tables(q_learning(config, environment, options, rules, length), options, length)
+        case SarsaConfig():
+            return _tables(sarsa(config, environment, options, rules, length), options, length)
+        case OptionCriticConfig():
+            _refuse_options("Option-critic", options, environment)
+            return _Plan(
+                algorithm=option_critic(config, environment, rules, length),
+                rounds=-(-length // STEPS_PER_ROUND),
+                of_carry=lambda carry: carry.learned,
+                choices=numbered_names(config.num_options),
+            )
         case IntraOptionConfig():
             return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)
         case HAMQConfig():

@@ -120,7 +120,7 @@ def _train(train: Train, agent: str) -> None:
         best = optimum(environment)
     except TooManyStates:
         best = None
-    judged = episodes_to_judge(environment)
+    judged = episodes_to_judge(policy)
     greedy = jax.tree.map(lambda leaf: leaf.mean(axis=1), play_many(policy, jax.random.key(0), judged))
     content: dict[str, Any] = {
         "agent": agent,

@@ -8,8 +8,11 @@ import jax
 import numpy as np
 import pytest
 
+from lodestone.agents.option_critic import nothing_learned
+from lodestone.agents.playing import play
 from lodestone.agents.saved import (
     GoalPolicy,
+    OptionCriticPolicy,
     Policy,
     UnitedPolicy,
     load_options,
@@ -18,6 +21,7 @@ from lodestone.agents.saved import (
     save_policy,
 )
 from lodestone.envs.base import example_state
+from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, arm_is_down, go_down_task, random_layouts
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Task
@@ -96,6 +100,47 @@ def test_networks_of_heads_come_back(kind, for_tasks, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, found.network(1), policy.network(1))
     assert found.options(1).names == policy.choices
     assert set(found.options(1).max_steps[1:]) == {5}
+
+
+ROOMS = FourRooms("code")
+
+
+def option_critic_policy() -> OptionCriticPolicy:
+    keys = iter(jax.random.split(jax.random.key(3), 4))
+    zeros = nothing_learned((2, 104, 3), 4)
+    learned = jax.tree.map(lambda leaf: jax.random.normal(next(keys), leaf.shape), zeros)
+    return OptionCriticPolicy("option-critic", ROOMS, Rules(step_limit=90), 0.5, learned, (4, 5))
+
+
+def test_learned_options_come_back(tmp_path):
+    policy = option_critic_policy()
+    save_policy(tmp_path / "policy.safetensors", policy)
+    found = load_policy(tmp_path / "policy.safetensors")
+    for name in ("agent", "environment", "rules", "temperature", "seeds", "choices"):
+        assert getattr(found, name) == getattr(policy, name)
+    state, (one, other) = example_state(ROOMS), (each.of_seed(1) for each in (found, policy))
+    np.testing.assert_array_equal(found.values_of(one)(state), other.table[0])
+    for name in ("action_probs", "termination"):
+        answers = [getattr(each, name)(state) for each in (found.options_of(one), policy.options_of(other))]
+        np.testing.assert_array_equal(*answers)
+    np.testing.assert_allclose(found.options_of(one).termination(state), jax.nn.sigmoid(other.exits[0]))
+    np.testing.assert_array_equal(play(found, jax.random.key(0)).steps, play(policy, jax.random.key(0)).steps)
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [{"num_options": 4, "temperature": 0.5}, {"num_options": 3, "temperature": 0.0}, {"num_options": 3, "heat": 1}, 7],
+)
+def test_learned_options_of_another_recipe_are_refused(recipe, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, option_critic_policy())
+    arrays, header = read_arrays(path)
+    write_arrays(path, arrays, header | {"option_critic": recipe})
+    with pytest.raises(BadFile):
+        load_policy(path)
+    write_arrays(path, {name: array for name, array in arrays.items() if "exits" not in name}, header)
+    with pytest.raises(BadFile, match="exits is missing"):
+        load_policy(path)
 
 
 @pytest.mark.parametrize("kind", [UnitedPolicy, GoalPolicy])
