@@ -17,9 +17,9 @@ update, a child is called, which may be a primitive action, or a subtask that ha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -27,14 +27,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, initial_state, next_step, sample_initial
+from lodestone.agents.q_learning import choose_entry
+from lodestone.envs.base import Environment, initial_state, sample_initial
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
-from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import Rules
-from lodestone.planning.enumerated import enumerated
+from lodestone.options.execution import Rules, uniforms
+from lodestone.planning.enumerated import enumerated, look_up_step
 from lodestone.planning.tables import tabulate
+from lodestone.subtasks.places import Places, arrange, may_be_running
 from lodestone.subtasks.recursive import polled_policy
 from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
 
@@ -74,107 +75,125 @@ class Learned(NamedTuple):
     such subtask."""
 
 
-class Hierarchy(NamedTuple):
-    """The stack of subtasks that run; D levels, the root is level 0."""
+class Stack(NamedTuple):
+    """The subtasks that run. Each is known by its place, and a caller's is above that of what it called."""
 
-    depth: Int[Array, ""]
-    """The level that is up."""
-    subtask: Int[Array, " D"]
-    edge: Int[Array, " D"]
-    """The call that each level made last."""
-    called_at: Int[Array, " D"]
+    subtask: tuple[Int[Array, ""], ...]
+    """The subtask that runs at each place; -1 for none."""
+    edge: tuple[Int[Array, ""], ...]
+    """The call that was made last from each place."""
+    called_at: tuple[Int[Array, ""], ...]
     """The step of the episode at which it was made."""
+
+
+class Lesson(NamedTuple):
+    """What is to be learned from the last step: from the calls that ended with it, the lowest first."""
+
+    values: tuple[Float[Array, ""], ...]
+    """V of the caller at each place, in the state that was reached; 0 where it has ended."""
+    inner_values: tuple[Float[Array, ""], ...]
+    """max Q~, or the pseudo-reward."""
+    ends_at: tuple[Int[Array, ""], ...]
+    """Updates up to and with those of each place."""
+    done: Int[Array, ""]
+    """Updates that have been made."""
 
 
 class Carry(NamedTuple):
     """Everything that one seed carries from round to round."""
 
     learned: Learned
-    hierarchy: Hierarchy
+    stack: Stack
+    lesson: Lesson
     state: Int[Array, ""]
     visited: Int[Array, " L"]
     """The states of the episode."""
     steps: Int[Array, ""]
     """Steps of the episode."""
-    level: Int[Array, ""]
-    """The level whose call has ended and is being learned from."""
-    position: Int[Array, ""]
-    """The step whose state is updated next; below the step of the call where there is nothing to learn from."""
-    cut: Bool[Array, ""]
-    """Whether the episode was ended by a limit, and the stack is being left without learning."""
     episode_return: Float[Array, ""]
     total_steps: Int[Array, ""]
     key: PRNGKeyArray
 
 
-class Values(NamedTuple):
-    """What is known about one state."""
-
-    nodes: Float[Array, " A+T"]
-    """V of every action and subtask, pseudo-rewards left out."""
-    inner_edges: Float[Array, " E"]
-    """Q~ of every call; -inf where it is not allowed."""
-    inner_subtasks: Float[Array, " T"]
-    """max Q~ of every subtask, or its pseudo-reward where it has ended."""
-    choices: Int[Array, " T"]
-    """The edge with the largest Q~, the first of equals."""
-
-
 FORBIDDEN = -2
-"""In place of a slot: the call is not allowed."""
+"""In place of a slot: there is no such call."""
 
 
-class Arrays(NamedTuple):
-    """`TaskTables` on the device, the state first."""
+class Calls(NamedTuple):
+    """The calls that the resident of one place may make, W at most in each state; looked up by state."""
 
-    completion_slot: Int[Array, "S E"]
-    """-1 where the completion is 0, `FORBIDDEN` where the call is not allowed."""
-    reward_slot: Int[Array, "S A"]
-    ends: Bool[Array, "S T"]
-    pseudo_rewards: Float[Array, "S T"]
-
-
-def on_device(tasks: TaskTables) -> Arrays:
-    """The arrays that `values_at` looks up."""
-    return Arrays(
-        completion_slot=jnp.asarray(np.where(tasks.available, tasks.completion_slot, FORBIDDEN).T),
-        reward_slot=jnp.asarray(tasks.reward_slot.T),
-        ends=jnp.asarray(tasks.ends.T),
-        pseudo_rewards=jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32),
-    )
+    edge: Int[Array, "S W"]
+    slot: Int[Array, "S W"]
+    """Where the completion is stored; -1 where it is 0, `FORBIDDEN` where there is no call."""
+    reward_slot: Int[Array, "S W"]
+    """Where the reward of a primitive action is stored."""
+    child_place: Int[Array, "S W"]
+    """The place of a subtask; -1 for a primitive action."""
+    child_places: tuple[frozenset[int], ...]
+    """For each of the W, what `child_place` may be."""
 
 
-def values_at(tasks: TaskTables, arrays: Arrays, learned: Learned, state: Int[Array, ""]) -> Values:
-    """All values of one state, from the primitive actions up."""
-    slot, ends = arrays.completion_slot[state], arrays.ends[state]
-    completions = jnp.where(slot >= 0, learned.values[slot], 0.0)
-    acts_otherwise = [bool(rewards.any()) for rewards in tasks.pseudo_rewards]
+class Known(NamedTuple):
+    """What is known about the resident of one place in a state."""
 
-    # One number at a time rather than arrays of a subtask's children: the compiler makes one loop over seeds of it all.
-    nodes = dict(enumerate(learned.values[arrays.reward_slot[state]]))
-    inner_edges: list[Array] = [jnp.float32(-jnp.inf)] * len(tasks.edges)
-    inner_subtasks, choices = {}, {}
-    for subtask in tasks.bottom_up:
-        best_inner, best_value, choice = jnp.float32(-jnp.inf), jnp.float32(0), jnp.int32(0)
-        for number in tasks.edges_of(subtask):
-            below, inner_completion = nodes[tasks.edges[number].child], completions[number]
-            if acts_otherwise[subtask]:
-                inner_completion = jnp.where(slot[number] >= 0, learned.inner[slot[number]], 0.0)
-            inner = jnp.where(slot[number] != FORBIDDEN, below + inner_completion, -jnp.inf)
-            better = inner > best_inner
-            best_inner = jnp.where(better, inner, best_inner)
-            best_value = jnp.where(better, below + completions[number], best_value)
-            choice = jnp.where(better, number, choice)
-            inner_edges[number] = inner
-        nodes[tasks.num_actions + subtask] = jnp.where(ends[subtask], 0.0, best_value)
-        after_end = arrays.pseudo_rewards[state, subtask] if acts_otherwise[subtask] else jnp.float32(0)
-        inner_subtasks[subtask] = jnp.where(ends[subtask], after_end, best_inner)
-        choices[subtask] = choice
+    value: Float[Array, ""]
+    """V, pseudo-rewards left out."""
+    inner_value: Float[Array, ""]
+    """max Q~."""
+    inner_calls: list[Float[Array, ""]]
+    """Q~ of its W calls; -inf where there is none."""
+    best: Int[Array, ""]
+    """The call with the largest Q~, the first of equals."""
 
-    def ordered(found: dict[int, Array]) -> Array:
-        return jnp.stack([found[number] for number in sorted(found)])
 
-    return Values(ordered(nodes), jnp.stack(inner_edges), ordered(inner_subtasks), ordered(choices))
+def calls_of(tasks: TaskTables, places: Places) -> list[Calls]:
+    """What `values_at` looks up, place by place."""
+    states = np.arange(tasks.ends.shape[1])[:, None]
+    children = np.array([edge.child for edge in tasks.edges])
+    place_of = np.array([-1] * tasks.num_actions + list(places.place_of))
+    found = []
+    for edge in places.calls:
+        child = np.where(edge >= 0, children[edge], -1)
+        primitive = np.minimum(child, tasks.num_actions - 1)
+        child_place = place_of[child]
+        found.append(
+            Calls(
+                edge=jnp.asarray(edge),
+                slot=jnp.asarray(np.where(edge >= 0, tasks.completion_slot[edge, states], FORBIDDEN)),
+                reward_slot=jnp.asarray(tasks.reward_slot[primitive, states]),
+                child_place=jnp.asarray(child_place, dtype=jnp.int32),
+                child_places=tuple(
+                    frozenset(place.tolist()) for place in (row[there] for row, there in zip(child_place.T, edge.T >= 0))
+                ),
+            )
+        )
+    return found
+
+
+def values_at(calls: Sequence[Calls], learned: Learned, state: Int[Array, ""]) -> list[Known]:
+    """All values of one state, place by place, from the primitive actions up."""
+    known: list[Known] = []
+    for here in calls:
+        slots, reward_slots, child_place = here.slot[state], here.reward_slot[state], here.child_place[state]
+        value, inner_value, best, row = jnp.float32(0), jnp.float32(-jnp.inf), jnp.int32(0), []
+        # One number at a time rather than rows of them: the compiler makes one loop over seeds of it all.
+        for number, child_places in enumerate(here.child_places):
+            slot = slots[number]
+            completion = inner_completion = jnp.where(slot >= 0, learned.values[slot], 0.0)
+            if len(learned.inner):
+                inner_completion = jnp.where(slot >= 0, learned.inner[slot], 0.0)
+            below = jnp.float32(0)
+            for place in sorted(child_places):
+                child = learned.values[reward_slots[number]] if place < 0 else known[place].value
+                below = jnp.where(child_place[number] == place, child, below) if len(child_places) > 1 else child
+            inner = jnp.where(slot == FORBIDDEN, -jnp.inf, below + inner_completion)
+            better = inner > inner_value
+            inner_value = jnp.where(better, inner, inner_value)
+            value = jnp.where(better, below + completion, value)
+            best = jnp.where(better, number, best)
+            row.append(inner)
+        known.append(Known(value, inner_value, row, best))
+    return known
 
 
 def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: Rules, steps: int) -> Algorithm:
@@ -193,117 +212,161 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     limit = min(limits)
     tables = tabulate(environment)
     tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    world, arrays = enumerated(tables, environment.action_names), on_device(tasks)
-    with_pseudo_rewards = bool(tasks.pseudo_rewards.any())
-    num_actions, levels = tasks.num_actions, graph.levels
-    caller = jnp.asarray([edge.subtask for edge in tasks.edges], dtype=jnp.int32)
-    edges_of = _padded([tasks.edges_of(subtask) for subtask in range(len(tasks.ends))])
+    world = enumerated(tables, environment.action_names)
+    places = arrange(tasks, may_be_running(tasks, tables))
+    calls, top = calls_of(tasks, places), len(places.calls) - 1
+    resident = jnp.asarray(places.resident)
+    completion_slot, reward_slot = jnp.asarray(tasks.completion_slot.T), jnp.asarray(tasks.reward_slot.T)
+    stored = jnp.asarray((tasks.completion_slot >= 0).any(axis=1))
     child_of = jnp.asarray([edge.child for edge in tasks.edges], dtype=jnp.int32)
+    pseudo_rewards = jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32)
+    with_pseudo_rewards = bool(tasks.pseudo_rewards.any())
     powers = jnp.asarray(rules.discount ** np.arange(limit + 1), dtype=jnp.float32)
+    nothing = (jnp.int32(0),) * (top + 1)
+    only_root = (jnp.int32(-1),) * top + (jnp.int32(0),)
+    no_lesson = Lesson((jnp.float32(0),) * (top + 1), (jnp.float32(0),) * (top + 1), nothing, jnp.int32(0))
 
     def init(key: PRNGKeyArray) -> Carry:
         start_key, key = jax.random.split(key)
-        zeros, none = jnp.zeros(tasks.num_slots), jnp.zeros(levels, dtype=jnp.int32)
+        zeros = jnp.zeros(tasks.num_slots)
         return Carry(
             learned=Learned(zeros, zeros if with_pseudo_rewards else jnp.zeros(0)),
-            hierarchy=Hierarchy(jnp.int32(0), none, none, none),
+            stack=Stack(only_root, nothing, nothing),
+            lesson=no_lesson,
             state=sample_initial(world, start_key),
             visited=jnp.zeros(limit, dtype=jnp.int32),
             steps=jnp.int32(0),
-            level=jnp.int32(0),
-            position=jnp.int32(-1),
-            cut=jnp.bool_(False),
             episode_return=jnp.float32(0),
             total_steps=jnp.int32(0),
             key=key,
         )
 
-    def event(
-        carry: Carry, noise: Float[Array, "4"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
-    ) -> tuple[Carry, RoundLog]:
-        """Update some states if a call has ended; if all are done, return from a subtask that has ended; else call a
-        child, which, if it is a primitive action, acts."""
-        hierarchy, state, steps = carry.hierarchy, carry.state, carry.steps
-        known, ends = values_at(tasks, arrays, carry.learned, state), arrays.ends[state]
+    def learn(carry: Carry, learning_rate: Float[Array, ""]) -> tuple[Learned, Float[Array, ""]]:
+        """Some of the updates that are left."""
+        (table, inner), (values, inner_values, ends_at, done), loss = carry.learned, carry.lesson, jnp.float32(0)
+        for number in [done + n for n in range(UPDATES_PER_EVENT)]:
 
-        edge, first = hierarchy.edge[carry.level], hierarchy.called_at[carry.level]
-        value, inner_value = known.nodes[num_actions + caller[edge]], known.inner_subtasks[caller[edge]]
-        position, (values, inner), loss = carry.position, carry.learned, jnp.float32(0)
-        for _ in range(UPDATES_PER_EVENT if config.all_states else 1):
-            due = position >= first
-            slot = jnp.where(due, arrays.completion_slot[carry.visited[position], edge], -1)
-            weight = powers[steps - position]
-            values, error = _move(values, slot, weight * value, learning_rate)
+            def of_place(options, number=number):
+                return reduce(
+                    lambda found, here: jnp.where(number < here[0], here[1], found),
+                    reversed(list(zip(ends_at[:-1], options[:-1]))),
+                    options[-1],
+                )
+
+            back = number - of_place((jnp.int32(0), *ends_at[:-1]))
+            position = carry.steps - 1 - back if config.all_states else of_place(carry.stack.called_at)
+            slot = completion_slot[carry.visited[position], of_place(carry.stack.edge)]
+            slot = jnp.where(number < ends_at[-1], slot, -1)
+            weight = powers[carry.steps - position]
+            table, error = _move(table, slot, weight * of_place(values), learning_rate)
             if with_pseudo_rewards:
-                inner, _ = _move(inner, slot, weight * inner_value, learning_rate)
+                inner, _ = _move(inner, slot, weight * of_place(inner_values), learning_rate)
             loss += jnp.square(error)
-            position -= due.astype(jnp.int32)
+        return Learned(table, inner), loss
 
-        up, subtask = hierarchy.depth, hierarchy.subtask[hierarchy.depth]
-        updating = position >= first
-        ended = ends[hierarchy.subtask] & (jnp.arange(levels) <= up)
-        returning = ~updating & (jnp.any(ended) | carry.cut)
-        calling = ~updating & ~returning
-        episode_over = returning & (up == 0)
+    def descend(
+        stack: Stack, known: list[Known], state: Int[Array, ""], steps: Int[Array, ""], noise, epsilon
+    ) -> tuple[Stack, Int[Array, ""]]:
+        """Calls from the lowest subtask that runs down to a primitive action; returns the lowest place, too."""
+        subtask, edge, called_at = (list(leaf) for leaf in stack)
+        at, chance = jnp.int32(top), iter(noise)
+        for place in reversed(range(top + 1)):
+            at = jnp.where(subtask[place] >= 0, place, at)
+        for place in reversed(range(top + 1)):
+            here, row = at == place, known[place].inner_calls
+            choice = jnp.int32(0)
+            if len(row) > 1:
+                choice = choose_entry(next(chance), next(chance), row, epsilon)
+            call = calls[place].edge[state, choice]
+            edge[place] = jnp.where(here, call, edge[place])
+            called_at[place] = jnp.where(here, steps, called_at[place])
+            for lower in range(place):
+                entered = here & (place_of_child[call] == lower)
+                subtask[lower] = jnp.where(entered, child_of[call] - tasks.num_actions, subtask[lower])
+                at = jnp.where(entered, lower, at)
+        return Stack(tuple(subtask), tuple(edge), tuple(called_at)), at
 
-        edges = edges_of[subtask]
-        row = jnp.where(edges >= 0, known.inner_edges[edges], -jnp.inf)
-        choice = edges[epsilon_greedy(noise[:2], row, row > -jnp.inf, epsilon)]
-        child = child_of[choice]
-        acting = calling & (child < num_actions)
-        descending = calling & ~acting
-        action = jnp.minimum(child, num_actions - 1)
-        step = next_step(world, noise[2], state, action)
-        terminated = step.terminated | arrays.ends[step.state, 0]  # the root may end before the environment does
-        cut = acting & (steps + 1 >= limit) & ~terminated
-        values, error = _move(
-            values, jnp.where(acting, arrays.reward_slot[state, action], -1), step.reward, learning_rate
+    place_of_child = jnp.asarray([-1] * tasks.num_actions + list(places.place_of), dtype=jnp.int32)[child_of]
+
+    def arrive(
+        stack: Stack, at: Int[Array, ""], known: list[Known], state: Int[Array, ""], steps: Int[Array, ""], cut
+    ) -> tuple[Stack, Lesson]:
+        """What there is to learn from a step, and the stack without what has ended. """
+        residents = resident[state]
+        running = [subtask >= 0 for subtask in stack.subtask]
+        ended = [there & (residents[place] != stack.subtask[place]) for place, there in enumerate(running)]
+        values, inner_values, ends_at = [], [], []
+        below_ended, updates = jnp.bool_(False), jnp.int32(0)
+        for place in range(top + 1):
+            values.append(jnp.where(ended[place], 0.0, known[place].value))
+            after_end = pseudo_rewards[state, stack.subtask[place]]
+            inner_values.append(jnp.where(ended[place], after_end, known[place].inner_value))
+            length = steps - stack.called_at[place] if config.all_states else jnp.int32(1)
+            learns = (at == place) | (running[place] & below_ended & ~cut)
+            updates += jnp.where(learns & stored[stack.edge[place]], length, 0)
+            ends_at.append(updates)
+            below_ended = jnp.where(running[place], ended[place], below_ended)
+        subtask, gone = list(stack.subtask), cut
+        for place in reversed(range(top + 1)):
+            gone |= ended[place]
+            subtask[place] = jnp.where(gone, -1, subtask[place])
+        return stack._replace(subtask=tuple(subtask)), Lesson(
+            tuple(values), tuple(inner_values), tuple(ends_at), jnp.int32(0)
         )
 
-        # A call is learned from when it has ended by itself, not when a subtask above it has.
-        from_child = returning & ~episode_over & ends[subtask] & ~carry.cut
-        level = jnp.where(acting, up, jnp.where(returning, up - 1, carry.level))
-        last = jnp.where(acting, steps, steps - 1)
-        if not config.all_states:
-            last = jnp.where(acting, steps, hierarchy.called_at[jnp.maximum(up - 1, 0)])
-        position = jnp.where(acting | from_child, last, jnp.where(updating, position, -1))
+    def event(
+        carry: Carry, noise: Float[Array, " N"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
+    ) -> tuple[Carry, RoundLog]:
+        """Update some states whose calls have ended; if none is left, leave what has ended, and act."""
+        state, steps = carry.state, carry.steps
+        carry = carry._replace(visited=carry.visited.at[steps].set(state, mode="drop"))
+        learned, loss = learn(carry, learning_rate)
+        done = carry.lesson.done + UPDATES_PER_EVENT
+        over = (done >= carry.lesson.ends_at[-1]) & (carry.stack.subtask[top] < 0)
+        acting = (done >= carry.lesson.ends_at[-1]) & ~over
 
-        called = jnp.arange(levels) == jnp.where(calling, up, levels)
-        entered = jnp.arange(levels) == jnp.where(descending, up + 1, levels)
-        after = Hierarchy(
-            depth=jnp.where(episode_over, 0, up + descending.astype(jnp.int32) - returning.astype(jnp.int32)),
-            subtask=jnp.where(entered, child - num_actions, hierarchy.subtask),
-            edge=jnp.where(called, choice, hierarchy.edge),
-            called_at=jnp.where(called, steps, hierarchy.called_at),
+        stack, at = descend(carry.stack, values_at(calls, learned, state), state, steps, noise, epsilon)
+        action = child_of[pick(stack.edge, at)]
+        step = look_up_step(world, noise[-1], state, action)
+        slot = jnp.where(acting, reward_slot[state, action], -1)
+        table, error = _move(learned.values, slot, step.reward, learning_rate)
+        learned = learned._replace(values=table)
+        terminated = resident[step.state, top] < 0  # the root may end before the environment does
+        cut = (steps + 1 >= limit) & ~terminated
+        popped, lesson = arrive(stack, at, values_at(calls, learned, step.state), step.state, steps + 1, cut)
+
+        total = carry.episode_return + step.reward
+        new = carry._replace(
+            stack=popped, lesson=lesson, state=step.state, steps=steps + 1, episode_return=total,
+            total_steps=carry.total_steps + 1,
         )
-        moved = jnp.where(acting, step.state, state)
-        total = jnp.where(acting, carry.episode_return + step.reward, carry.episode_return)
-        taken = steps + acting.astype(jnp.int32)
-        next_carry = Carry(
-            learned=Learned(values, inner),
-            hierarchy=after,
-            state=jnp.where(episode_over, initial_state(world, noise[3]), moved),
-            visited=carry.visited.at[jnp.where(acting, steps, limit)].set(state, mode="drop"),
-            steps=jnp.where(episode_over, 0, taken),
-            level=level,
-            position=position,
-            cut=(carry.cut | cut) & ~episode_over,
-            episode_return=jnp.where(episode_over, 0.0, total),
-            total_steps=carry.total_steps + acting.astype(jnp.int32),
-            key=carry.key,
+        restarted = carry._replace(
+            stack=carry.stack._replace(subtask=only_root),
+            lesson=no_lesson,
+            state=initial_state(world, noise[-1]),
+            steps=jnp.int32(0),
+            episode_return=jnp.float32(0),
         )
+        waiting = carry._replace(lesson=carry.lesson._replace(done=done))
+        fixed = dict(learned=0, visited=0, key=jnp.int32(0))
+        next_carry = jax.tree.map(
+            lambda a, b, c: jnp.where(acting, a, jnp.where(over, b, c)),
+            new._replace(**fixed), restarted._replace(**fixed), waiting._replace(**fixed),
+        )._replace(learned=learned, visited=carry.visited, key=carry.key)
         log = RoundLog(
             valid=acting,
-            option=choice,
+            option=pick(stack.edge, at),
             steps=jnp.int32(1),
             episode_ended=terminated | cut,
             terminated=terminated,
             episode_return=total,
-            episode_steps=taken,
-            episode_decisions=taken,
+            episode_steps=steps + 1,
+            episode_decisions=steps + 1,
             loss=loss + jnp.square(error),
         )
         return next_carry, log
+
+    num_noise = 1 + 2 * sum(here.edge.shape[1] > 1 for here in calls)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`EVENTS_PER_ROUND` events."""
@@ -312,11 +375,16 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         epsilon = piecewise_linear(config.epsilon, fraction)
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         noise_key, key = jax.random.split(carry.key)
-        noise = jax.random.uniform(noise_key, (EVENTS_PER_ROUND, 4))
+        noise = uniforms(noise_key, (EVENTS_PER_ROUND, num_noise))
         carry, log = jax.lax.scan(lambda carry, noise: event(carry, noise, epsilon, learning_rate), carry, noise)
         return carry._replace(key=key), log._replace(loss=jnp.mean(log.loss))
 
     return Algorithm(init, run_round)
+
+
+def pick(options: Sequence[Array], number: Int[Array, ""]) -> Array:
+    """The option of that number, by comparisons: for a few of them that is faster than a look-up."""
+    return reduce(lambda found, one: jnp.where(number == one[0], one[1], found), enumerate(options), options[0])
 
 
 def _move(
