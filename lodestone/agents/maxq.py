@@ -12,7 +12,7 @@ R~ is what a subtask acts by; C without it is what its caller sees. *All-states 
 that the child went through. MAXQ-0 is the case without pseudo-rewards and without all-states updating.
 
 The recursion is unrolled into events, one at a time in every seed: a few states are updated, and, when none is left to
-update, a child is called, which may be a primitive action, or a subtask that has ended is left.
+update, children are called down to a primitive action, which acts, and what has ended is left.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import choose_entry
+from lodestone.agents.q_learning import choose_among
 from lodestone.envs.base import Environment, initial_state, sample_initial
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
@@ -35,9 +35,10 @@ from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.execution import Rules, uniforms
 from lodestone.planning.enumerated import enumerated, look_up_step
 from lodestone.planning.tables import tabulate
-from lodestone.subtasks.places import Places, arrange, may_be_running
+from lodestone.subtasks.places import arrange, may_be_running
 from lodestone.subtasks.recursive import polled_policy
 from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
+from lodestone.subtasks.values import Known, evaluator
 
 EVENTS_PER_ROUND = 32
 """Events between two looks at the schedules."""
@@ -76,7 +77,7 @@ class Learned(NamedTuple):
 
 
 class Stack(NamedTuple):
-    """The subtasks that run. Each is known by its place, and a caller's is above that of what it called."""
+    """The subtasks that run, by their places (`Places`): a caller's is above that of what it calls."""
 
     subtask: tuple[Int[Array, ""], ...]
     """The subtask that runs at each place; -1 for none."""
@@ -87,16 +88,16 @@ class Stack(NamedTuple):
 
 
 class Lesson(NamedTuple):
-    """What is to be learned from the last step: from the calls that ended with it, the lowest first."""
+    """What the last step has to teach: about the calls that ended with it, from the lowest place up."""
 
     values: tuple[Float[Array, ""], ...]
-    """V of the caller at each place, in the state that was reached; 0 where it has ended."""
+    """V of the caller at each place where the step led to; 0 if it has ended there."""
     inner_values: tuple[Float[Array, ""], ...]
-    """max Q~, or the pseudo-reward."""
-    ends_at: tuple[Int[Array, ""], ...]
-    """Updates up to and with those of each place."""
+    """max Q~, or the pseudo-reward; 0 where no subtask acts by one."""
+    updates: tuple[Int[Array, ""], ...]
+    """Updates of each place and those below."""
     done: Int[Array, ""]
-    """Updates that have been made."""
+    """Updates that have been made, or more."""
 
 
 class Carry(NamedTuple):
@@ -115,87 +116,6 @@ class Carry(NamedTuple):
     key: PRNGKeyArray
 
 
-FORBIDDEN = -2
-"""In place of a slot: there is no such call."""
-
-
-class Calls(NamedTuple):
-    """The calls that the resident of one place may make, W at most in each state; looked up by state."""
-
-    edge: Int[Array, "S W"]
-    slot: Int[Array, "S W"]
-    """Where the completion is stored; -1 where it is 0, `FORBIDDEN` where there is no call."""
-    reward_slot: Int[Array, "S W"]
-    """Where the reward of a primitive action is stored."""
-    child_place: Int[Array, "S W"]
-    """The place of a subtask; -1 for a primitive action."""
-    child_places: tuple[frozenset[int], ...]
-    """For each of the W, what `child_place` may be."""
-
-
-class Known(NamedTuple):
-    """What is known about the resident of one place in a state."""
-
-    value: Float[Array, ""]
-    """V, pseudo-rewards left out."""
-    inner_value: Float[Array, ""]
-    """max Q~."""
-    inner_calls: list[Float[Array, ""]]
-    """Q~ of its W calls; -inf where there is none."""
-    best: Int[Array, ""]
-    """The call with the largest Q~, the first of equals."""
-
-
-def calls_of(tasks: TaskTables, places: Places) -> list[Calls]:
-    """What `values_at` looks up, place by place."""
-    states = np.arange(tasks.ends.shape[1])[:, None]
-    children = np.array([edge.child for edge in tasks.edges])
-    place_of = np.array([-1] * tasks.num_actions + list(places.place_of))
-    found = []
-    for edge in places.calls:
-        child = np.where(edge >= 0, children[edge], -1)
-        primitive = np.minimum(child, tasks.num_actions - 1)
-        child_place = place_of[child]
-        found.append(
-            Calls(
-                edge=jnp.asarray(edge),
-                slot=jnp.asarray(np.where(edge >= 0, tasks.completion_slot[edge, states], FORBIDDEN)),
-                reward_slot=jnp.asarray(tasks.reward_slot[primitive, states]),
-                child_place=jnp.asarray(child_place, dtype=jnp.int32),
-                child_places=tuple(
-                    frozenset(place.tolist()) for place in (row[there] for row, there in zip(child_place.T, edge.T >= 0))
-                ),
-            )
-        )
-    return found
-
-
-def values_at(calls: Sequence[Calls], learned: Learned, state: Int[Array, ""]) -> list[Known]:
-    """All values of one state, place by place, from the primitive actions up."""
-    known: list[Known] = []
-    for here in calls:
-        slots, reward_slots, child_place = here.slot[state], here.reward_slot[state], here.child_place[state]
-        value, inner_value, best, row = jnp.float32(0), jnp.float32(-jnp.inf), jnp.int32(0), []
-        # One number at a time rather than rows of them: the compiler makes one loop over seeds of it all.
-        for number, child_places in enumerate(here.child_places):
-            slot = slots[number]
-            completion = inner_completion = jnp.where(slot >= 0, learned.values[slot], 0.0)
-            if len(learned.inner):
-                inner_completion = jnp.where(slot >= 0, learned.inner[slot], 0.0)
-            below = jnp.float32(0)
-            for place in sorted(child_places):
-                child = learned.values[reward_slots[number]] if place < 0 else known[place].value
-                below = jnp.where(child_place[number] == place, child, below) if len(child_places) > 1 else child
-            inner = jnp.where(slot == FORBIDDEN, -jnp.inf, below + inner_completion)
-            better = inner > inner_value
-            inner_value = jnp.where(better, inner, inner_value)
-            value = jnp.where(better, below + completion, value)
-            best = jnp.where(better, number, best)
-            row.append(inner)
-        known.append(Known(value, inner_value, row, best))
-    return known
-
-
 def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: Rules, steps: int) -> Algorithm:
     """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
     `steps`, primitive steps.
@@ -212,26 +132,34 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     limit = min(limits)
     tables = tabulate(environment)
     tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    world = enumerated(tables, environment.action_names)
+    world, num_actions, num_edges = enumerated(tables, environment.action_names), tasks.num_actions, len(tasks.edges)
     places = arrange(tasks, may_be_running(tasks, tables))
-    calls, top = calls_of(tasks, places), len(places.calls) - 1
+    evaluate, top = evaluator(tasks, places), len(places.calls) - 1
+    draws = 1 + 2 * sum(edges.shape[1] > 1 for edges in places.calls)
+
+    # Arrays that two numbers look up are flat: one index is put together far faster than two.
+    completion_slot, reward_slot = (
+        jnp.asarray(tasks.completion_slot.T.ravel()),
+        jnp.asarray(tasks.reward_slot.T.ravel()),
+    )
+    calls = [jnp.asarray(edges.ravel()) for edges in places.calls]
     resident = jnp.asarray(places.resident)
-    completion_slot, reward_slot = jnp.asarray(tasks.completion_slot.T), jnp.asarray(tasks.reward_slot.T)
+    pseudo_rewards = jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32)
     stored = jnp.asarray((tasks.completion_slot >= 0).any(axis=1))
     child_of = jnp.asarray([edge.child for edge in tasks.edges], dtype=jnp.int32)
-    pseudo_rewards = jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32)
-    with_pseudo_rewards = bool(tasks.pseudo_rewards.any())
+    child_place = jnp.asarray([-1] * num_actions + list(places.place_of), dtype=jnp.int32)[child_of]
     powers = jnp.asarray(rules.discount ** np.arange(limit + 1), dtype=jnp.float32)
-    nothing = (jnp.int32(0),) * (top + 1)
+
     only_root = (jnp.int32(-1),) * top + (jnp.int32(0),)
-    no_lesson = Lesson((jnp.float32(0),) * (top + 1), (jnp.float32(0),) * (top + 1), nothing, jnp.int32(0))
+    no_numbers, no_values = (jnp.int32(0),) * (top + 1), (jnp.float32(0),) * (top + 1)
+    no_lesson = Lesson(no_values, no_values, no_numbers, jnp.int32(0))
 
     def init(key: PRNGKeyArray) -> Carry:
         start_key, key = jax.random.split(key)
         zeros = jnp.zeros(tasks.num_slots)
         return Carry(
-            learned=Learned(zeros, zeros if with_pseudo_rewards else jnp.zeros(0)),
-            stack=Stack(only_root, nothing, nothing),
+            learned=Learned(zeros, zeros if any(places.otherwise) else jnp.zeros(0)),
+            stack=Stack(only_root, no_numbers, no_numbers),
             lesson=no_lesson,
             state=sample_initial(world, start_key),
             visited=jnp.zeros(limit, dtype=jnp.int32),
@@ -241,103 +169,110 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
             key=key,
         )
 
-    def learn(carry: Carry, learning_rate: Float[Array, ""]) -> tuple[Learned, Float[Array, ""]]:
-        """Some of the updates that are left."""
-        (table, inner), (values, inner_values, ends_at, done), loss = carry.learned, carry.lesson, jnp.float32(0)
-        for number in [done + n for n in range(UPDATES_PER_EVENT)]:
-
-            def of_place(options, number=number):
-                return reduce(
-                    lambda found, here: jnp.where(number < here[0], here[1], found),
-                    reversed(list(zip(ends_at[:-1], options[:-1]))),
-                    options[-1],
-                )
-
-            back = number - of_place((jnp.int32(0), *ends_at[:-1]))
-            position = carry.steps - 1 - back if config.all_states else of_place(carry.stack.called_at)
-            slot = completion_slot[carry.visited[position], of_place(carry.stack.edge)]
-            slot = jnp.where(number < ends_at[-1], slot, -1)
+    def update(carry: Carry, learning_rate: Float[Array, ""]) -> tuple[Learned, Float[Array, ""]]:
+        """The next updates of the lesson, those of the latest states first; returns the sum of squared errors, too."""
+        (values, inner), stack, lesson = carry.learned, carry.stack, carry.lesson
+        loss = jnp.float32(0)
+        for offset in range(UPDATES_PER_EVENT if config.all_states else 1):
+            number = lesson.done + offset
+            at_place = partial(_first_above, number, lesson.updates)
+            back = number - at_place((0, *lesson.updates[:-1]))
+            position = carry.steps - 1 - back if config.all_states else at_place(stack.called_at)
+            slot = completion_slot[carry.visited[position] * num_edges + at_place(stack.edge)]
+            slot = jnp.where(number < lesson.updates[top], slot, -1)
             weight = powers[carry.steps - position]
-            table, error = _move(table, slot, weight * of_place(values), learning_rate)
-            if with_pseudo_rewards:
-                inner, _ = _move(inner, slot, weight * of_place(inner_values), learning_rate)
+            values, error = _move(values, slot, weight * at_place(lesson.values), learning_rate)
+            if any(places.otherwise):
+                slot = jnp.where(at_place(places.otherwise), slot, -1)
+                inner, _ = _move(inner, slot, weight * at_place(lesson.inner_values), learning_rate)
             loss += jnp.square(error)
-        return Learned(table, inner), loss
+        return Learned(values, inner), loss
 
     def descend(
-        stack: Stack, known: list[Known], state: Int[Array, ""], steps: Int[Array, ""], noise, epsilon
+        carry: Carry, known: list[Known], noise: Float[Array, " N"], epsilon: Float[Array, ""]
     ) -> tuple[Stack, Int[Array, ""]]:
-        """Calls from the lowest subtask that runs down to a primitive action; returns the lowest place, too."""
-        subtask, edge, called_at = (list(leaf) for leaf in stack)
-        at, chance = jnp.int32(top), iter(noise)
+        """Calls down to a primitive action; returns the place that calls it, too."""
+        subtask, edge, called_at = (list(leaf) for leaf in carry.stack)
+        caller, uniform = jnp.int32(top), iter(noise)
+        for place in reversed(range(top)):
+            caller = jnp.where(subtask[place] >= 0, place, caller)
         for place in reversed(range(top + 1)):
-            at = jnp.where(subtask[place] >= 0, place, at)
-        for place in reversed(range(top + 1)):
-            here, row = at == place, known[place].inner_calls
-            choice = jnp.int32(0)
-            if len(row) > 1:
-                choice = choose_entry(next(chance), next(chance), row, epsilon)
-            call = calls[place].edge[state, choice]
+            here, values, choice = caller == place, known[place].inner_calls, jnp.int32(0)
+            if len(values) > 1:
+                choice = choose_among(next(uniform), next(uniform), values, epsilon)
+            call = calls[place][carry.state * len(values) + choice]
             edge[place] = jnp.where(here, call, edge[place])
-            called_at[place] = jnp.where(here, steps, called_at[place])
+            called_at[place] = jnp.where(here, carry.steps, called_at[place])
             for lower in range(place):
-                entered = here & (place_of_child[call] == lower)
-                subtask[lower] = jnp.where(entered, child_of[call] - tasks.num_actions, subtask[lower])
-                at = jnp.where(entered, lower, at)
-        return Stack(tuple(subtask), tuple(edge), tuple(called_at)), at
-
-    place_of_child = jnp.asarray([-1] * tasks.num_actions + list(places.place_of), dtype=jnp.int32)[child_of]
+                entered = here & (child_place[call] == lower)
+                subtask[lower] = jnp.where(entered, child_of[call] - num_actions, subtask[lower])
+                caller = jnp.where(entered, lower, caller)
+        return Stack(tuple(subtask), tuple(edge), tuple(called_at)), caller
 
     def arrive(
-        stack: Stack, at: Int[Array, ""], known: list[Known], state: Int[Array, ""], steps: Int[Array, ""], cut
+        stack: Stack, caller: Int[Array, ""], steps: Int[Array, ""], state: Int[Array, ""], learned: Learned
     ) -> tuple[Stack, Lesson]:
-        """What there is to learn from a step, and the stack without what has ended. """
-        residents = resident[state]
+        """What is left of the stack after a step, and what is learned. `caller` is the place that called the action.
+
+        A call is learned from when it has ended by itself, not when a subtask above it has. All values can be known
+        before the first update, as none of them depends on it: they are those of callers whose calls have ended.
+        """
+        known, residents = evaluate(*learned, state), resident[state]
+        cut = (steps >= limit) & (residents[top] >= 0)
         running = [subtask >= 0 for subtask in stack.subtask]
-        ended = [there & (residents[place] != stack.subtask[place]) for place, there in enumerate(running)]
-        values, inner_values, ends_at = [], [], []
-        below_ended, updates = jnp.bool_(False), jnp.int32(0)
+        ended = [runs & (residents[place] != stack.subtask[place]) for place, runs in enumerate(running)]
+        values, inner_values, updates, total = [], [], [], jnp.int32(0)
+        call_ended = jnp.bool_(False)
         for place in range(top + 1):
             values.append(jnp.where(ended[place], 0.0, known[place].value))
-            after_end = pseudo_rewards[state, stack.subtask[place]]
-            inner_values.append(jnp.where(ended[place], after_end, known[place].inner_value))
+            inner_value = jnp.float32(0)
+            if places.otherwise[place]:
+                after_end = pseudo_rewards[state, stack.subtask[place]]
+                inner_value = jnp.where(ended[place], after_end, known[place].inner_value)
+            inner_values.append(inner_value)
+            learns = ((caller == place) | (running[place] & call_ended & ~cut)) & stored[stack.edge[place]]
             length = steps - stack.called_at[place] if config.all_states else jnp.int32(1)
-            learns = (at == place) | (running[place] & below_ended & ~cut)
-            updates += jnp.where(learns & stored[stack.edge[place]], length, 0)
-            ends_at.append(updates)
-            below_ended = jnp.where(running[place], ended[place], below_ended)
-        subtask, gone = list(stack.subtask), cut
+            total += jnp.where(learns, length, 0)
+            updates.append(total)
+            call_ended = jnp.where(running[place], ended[place], call_ended)
+        subtask, left = list(stack.subtask), cut
         for place in reversed(range(top + 1)):
-            gone |= ended[place]
-            subtask[place] = jnp.where(gone, -1, subtask[place])
-        return stack._replace(subtask=tuple(subtask)), Lesson(
-            tuple(values), tuple(inner_values), tuple(ends_at), jnp.int32(0)
-        )
+            left |= ended[place]
+            subtask[place] = jnp.where(left, -1, subtask[place])
+        lesson = Lesson(tuple(values), tuple(inner_values), tuple(updates), jnp.int32(0))
+        return stack._replace(subtask=tuple(subtask)), lesson
 
     def event(
         carry: Carry, noise: Float[Array, " N"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
     ) -> tuple[Carry, RoundLog]:
-        """Update some states whose calls have ended; if none is left, leave what has ended, and act."""
-        state, steps = carry.state, carry.steps
-        carry = carry._replace(visited=carry.visited.at[steps].set(state, mode="drop"))
-        learned, loss = learn(carry, learning_rate)
-        done = carry.lesson.done + UPDATES_PER_EVENT
-        over = (done >= carry.lesson.ends_at[-1]) & (carry.stack.subtask[top] < 0)
-        acting = (done >= carry.lesson.ends_at[-1]) & ~over
+        """Some updates; if none is left, an action, or a new episode where the root has been left."""
+        state = carry.state
+        # Written before it is read, or else the compiler copies it all.
+        carry = carry._replace(visited=carry.visited.at[carry.steps].set(state, mode="drop"))
+        learned, loss = update(carry, learning_rate)
+        done = carry.lesson.done + (UPDATES_PER_EVENT if config.all_states else 1)
+        ready = done >= carry.lesson.updates[top]
+        # The root has been left, or had ended where the episode began.
+        over = (carry.stack.subtask[top] < 0) | (resident[state, top] < 0)
+        acting = ready & ~over
 
-        stack, at = descend(carry.stack, values_at(calls, learned, state), state, steps, noise, epsilon)
-        action = child_of[pick(stack.edge, at)]
+        stack, caller = descend(carry, evaluate(*learned, state), noise, epsilon)
+        edge = _at(caller, stack.edge)
+        action = jnp.minimum(child_of[edge], num_actions - 1)
         step = look_up_step(world, noise[-1], state, action)
-        slot = jnp.where(acting, reward_slot[state, action], -1)
-        table, error = _move(learned.values, slot, step.reward, learning_rate)
-        learned = learned._replace(values=table)
+        slot = jnp.where(acting, reward_slot[state * num_actions + action], -1)
+        values, error = _move(learned.values, slot, step.reward, learning_rate)
+        learned = learned._replace(values=values)
+        steps = carry.steps + 1
+        left, lesson = arrive(stack, caller, steps, step.state, learned)
         terminated = resident[step.state, top] < 0  # the root may end before the environment does
-        cut = (steps + 1 >= limit) & ~terminated
-        popped, lesson = arrive(stack, at, values_at(calls, learned, step.state), step.state, steps + 1, cut)
 
-        total = carry.episode_return + step.reward
-        new = carry._replace(
-            stack=popped, lesson=lesson, state=step.state, steps=steps + 1, episode_return=total,
+        acted = carry._replace(
+            stack=left,
+            lesson=lesson,
+            state=step.state,
+            steps=steps,
+            episode_return=carry.episode_return + step.reward,
             total_steps=carry.total_steps + 1,
         )
         restarted = carry._replace(
@@ -348,25 +283,19 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
             episode_return=jnp.float32(0),
         )
         waiting = carry._replace(lesson=carry.lesson._replace(done=done))
-        fixed = dict(learned=0, visited=0, key=jnp.int32(0))
-        next_carry = jax.tree.map(
-            lambda a, b, c: jnp.where(acting, a, jnp.where(over, b, c)),
-            new._replace(**fixed), restarted._replace(**fixed), waiting._replace(**fixed),
-        )._replace(learned=learned, visited=carry.visited, key=carry.key)
+        next_carry = _select(acting, acted, _select(ready, restarted, waiting))
         log = RoundLog(
             valid=acting,
-            option=pick(stack.edge, at),
+            option=edge,
             steps=jnp.int32(1),
-            episode_ended=terminated | cut,
+            episode_ended=left.subtask[top] < 0,
             terminated=terminated,
-            episode_return=total,
-            episode_steps=steps + 1,
-            episode_decisions=steps + 1,
+            episode_return=acted.episode_return,
+            episode_steps=steps,
+            episode_decisions=steps,
             loss=loss + jnp.square(error),
         )
-        return next_carry, log
-
-    num_noise = 1 + 2 * sum(here.edge.shape[1] > 1 for here in calls)
+        return next_carry._replace(learned=learned), log
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`EVENTS_PER_ROUND` events."""
@@ -375,16 +304,11 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         epsilon = piecewise_linear(config.epsilon, fraction)
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         noise_key, key = jax.random.split(carry.key)
-        noise = uniforms(noise_key, (EVENTS_PER_ROUND, num_noise))
+        noise = uniforms(noise_key, (EVENTS_PER_ROUND, draws))
         carry, log = jax.lax.scan(lambda carry, noise: event(carry, noise, epsilon, learning_rate), carry, noise)
         return carry._replace(key=key), log._replace(loss=jnp.mean(log.loss))
 
     return Algorithm(init, run_round)
-
-
-def pick(options: Sequence[Array], number: Int[Array, ""]) -> Array:
-    """The option of that number, by comparisons: for a few of them that is faster than a look-up."""
-    return reduce(lambda found, one: jnp.where(number == one[0], one[1], found), enumerate(options), options[0])
 
 
 def _move(
@@ -393,6 +317,24 @@ def _move(
     """The value of a slot moved towards a target, and the error; nothing where the slot is negative."""
     error = jnp.where(slot >= 0, target - values[slot], 0.0)
     return values.at[slot].add(learning_rate * error), error
+
+
+def _at(place: Int[Array, ""], numbers: Sequence[Array]) -> Array:
+    """The number of a place, by comparisons: of a few that is faster than a look-up."""
+    return reduce(lambda found, one: jnp.where(place == one[0], one[1], found), enumerate(numbers), numbers[0])
+
+
+def _first_above(number: Int[Array, ""], bounds: Sequence[Array], options: Sequence[Array | int]) -> Array:
+    """The option of the first place whose bound is above a number; of the last place if none is."""
+    found = jnp.asarray(options[-1])
+    for bound, option in zip(bounds[-2::-1], options[-2::-1], strict=True):
+        found = jnp.where(number < bound, option, found)
+    return found
+
+
+def _select(condition: Bool[Array, ""], one: Carry, other: Carry) -> Carry:
+    """What differs between two, entry by entry."""
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), one, other)
 
 
 def as_configured(config: MAXQConfig, graph: TaskGraph) -> TaskGraph:
@@ -406,9 +348,25 @@ def chooser(
 ) -> Callable[[Learned], Int[np.ndarray, "N T S"]]:
     """A function from what N seeds have learned to the edge that each subtask takes in each state; -1 where it has
     ended. Compiled once."""
-    tasks, everywhere = _everywhere(config, environment, graph)
-    ask = jax.jit(jax.vmap(everywhere))
-    return lambda learned: np.where(tasks.ends, -1, np.asarray(ask(learned).choices).swapaxes(1, 2))
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
+    places = arrange(tasks, ~tasks.ends)
+    evaluate, states = evaluator(tasks, places), np.arange(tables.num_states)
+
+    @jax.jit
+    def best(learned: Learned) -> list[Int[Array, "N S"]]:
+        def of_state(learned: Learned, state: Int[Array, ""]) -> list[Int[Array, ""]]:
+            return [known.best for known in evaluate(*learned, state)]
+
+        each_state = jax.vmap(of_state, in_axes=(None, 0))
+        return jax.vmap(each_state, in_axes=(0, None))(learned, jnp.asarray(states))
+
+    def choose_edges(learned: Learned) -> Int[np.ndarray, "N T S"]:
+        found = best(jax.tree.map(jnp.asarray, learned))
+        chosen = [places.calls[place][states, np.asarray(found[place])] for place in places.place_of]
+        return np.where(tasks.ends, -1, np.stack(chosen, axis=1))
+
+    return choose_edges
 
 
 def polled_values(
@@ -417,24 +375,20 @@ def polled_values(
     """What each of N seeds expects of each primitive action where every step asks anew from the root down: the rewards
     and completions along the best path to the action, -inf where there is none. The maximum of a row is the action that
     polling takes, also where pseudo-rewards choose another path than the best."""
-    tasks, everywhere = _everywhere(config, environment, graph)
-    values = jax.tree.map(np.asarray, jax.jit(jax.vmap(everywhere))(jax.tree.map(jnp.asarray, learned)))
-    seeds = zip(np.asarray(learned.values), values.nodes, values.choices, strict=True)
-    return np.stack([_polled_values(tasks, *seed) for seed in seeds])
+    tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
+    choices = chooser(config, environment, graph)(learned)
+    return np.stack([_polled_values(tasks, *seed) for seed in zip(np.asarray(learned.values), choices, strict=True)])
 
 
 def _polled_values(
-    tasks: TaskTables,
-    stored: Float[np.ndarray, " slots"],
-    nodes: Float[np.ndarray, "S A+T"],
-    choices: Int[np.ndarray, "S T"],
+    tasks: TaskTables, stored: Float[np.ndarray, " slots"], choices: Int[np.ndarray, "T S"]
 ) -> Float[np.ndarray, "S A"]:
     states = np.arange(tasks.ends.shape[1])
     slots = tasks.completion_slot
     completions = np.where(slots >= 0, stored[slots], 0.0)
     paths = {action: np.full((len(states), tasks.num_actions), -np.inf) for action in range(tasks.num_actions)}
     for action, path in paths.items():
-        path[:, action] = nodes[:, action]
+        path[:, action] = stored[tasks.reward_slot[action]]
     for subtask in tasks.bottom_up:
         calls = [
             np.where(tasks.available[number], completions[number], -np.inf)[:, None] + paths[tasks.edges[number].child]
@@ -442,32 +396,12 @@ def _polled_values(
         ]
         paths[tasks.num_actions + subtask] = np.max(calls, axis=0)
     found = np.where(tasks.ends[0][:, None], 0.0, paths[tasks.num_actions])
-    polled = polled_policy(tasks, np.where(tasks.ends, -1, choices.T))
+    polled = polled_policy(tasks, choices)
     found[states, polled] = np.nextafter(found.max(axis=1).astype(np.float32), np.float32(np.inf))
     return found.astype(np.float32)
 
 
-def _everywhere(
-    config: MAXQConfig, environment: Environment, graph: TaskGraph
-) -> tuple[TaskTables, Callable[[Learned], Values]]:
-    """The tasks, and a function from what one seed has learned to what it knows about every state."""
-    tables = tabulate(environment)
-    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    arrays = on_device(tasks)
-
-    def everywhere(learned: Learned) -> Values:
-        return jax.vmap(partial(values_at, tasks, arrays, learned))(jnp.arange(tables.num_states))
-
-    return tasks, everywhere
-
-
 def rounds_for(graph: TaskGraph, steps: int) -> int:
-    """Rounds that are surely enough for so many primitive steps: an action takes an event to be called and one to be
-    learned from, and every level above it at most a call, a return and an update a step."""
-    return -(-steps * (2 + 3 * (graph.levels - 1)) // EVENTS_PER_ROUND)
-
-
-def _padded(rows: list[tuple[int, ...]]) -> Int[Array, "T U"]:
-    """Rows of one length, filled up with -1."""
-    width = max(map(len, rows))
-    return jnp.asarray([row + (-1,) * (width - len(row)) for row in rows], dtype=jnp.int32)
+    """Rounds that are surely enough for so many primitive steps: an event acts, begins an episode, or makes an update,
+    of which a step brings at most one a level."""
+    return -(-steps * (2 + graph.levels) // EVENTS_PER_ROUND)

@@ -26,6 +26,8 @@ class Places(NamedTuple):
     calls: tuple[Int[np.ndarray, "S W"], ...]
     """For each place, the edges that its resident may take, in the order of its children, filled up with -1. W is as
     many as there are in any state."""
+    otherwise: tuple[bool, ...]
+    """For each place, whether a resident acts by a pseudo-reward."""
 
 
 def arrange(tasks: TaskTables, running: Bool[np.ndarray, "T S"]) -> Places:
@@ -51,7 +53,12 @@ def arrange(tasks: TaskTables, running: Bool[np.ndarray, "T S"]) -> Places:
         possible = (tasks.available & (here == caller[:, None])).T
         first = np.argsort(~possible, axis=1, kind="stable")[:, : possible.sum(axis=1).max()]
         calls.append(np.where(np.take_along_axis(possible, first, axis=1), first, -1).astype(np.int32))
-    return Places(tuple(place_of[subtask] for subtask in range(len(tasks.ends))), resident, tuple(calls))
+    return Places(
+        place_of=tuple(place_of[subtask] for subtask in range(len(tasks.ends))),
+        resident=resident,
+        calls=tuple(calls),
+        otherwise=tuple(bool(tasks.pseudo_rewards[np.unique(here[here >= 0])].any()) for here in resident.T),
+    )
 
 
 def may_be_running(tasks: TaskTables, tables: Tables) -> Bool[np.ndarray, "T S"]:
