@@ -137,11 +137,9 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     evaluate, top = evaluator(tasks, places), len(places.calls) - 1
     draws = 1 + 2 * sum(edges.shape[1] > 1 for edges in places.calls)
 
-    # Arrays that two numbers look up are flat: one index is put together far faster than two.
-    completion_slot, reward_slot = (
-        jnp.asarray(tasks.completion_slot.T.ravel()),
-        jnp.asarray(tasks.reward_slot.T.ravel()),
-    )
+    # What a state and another number look up is flat: one index is put together far faster than two.
+    completion_slot = jnp.asarray(tasks.completion_slot.T.ravel())
+    reward_slot = jnp.asarray(tasks.reward_slot.T.ravel())
     calls = [jnp.asarray(edges.ravel()) for edges in places.calls]
     resident = jnp.asarray(places.resident)
     pseudo_rewards = jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32)
