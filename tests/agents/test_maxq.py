@@ -153,9 +153,7 @@ class Recursion:
             if self.tasks.available[number, state]:
                 child, slot = self.tasks.edges[number].child, self.tasks.completion_slot[number, state]
                 below = child - self.tasks.num_actions
-                value = (
-                    self.values[self.tasks.reward_slot[child, state]] if below < 0 else self.best(below, state)[1]
-                )
+                value = self.values[self.tasks.reward_slot[child, state]] if below < 0 else self.best(below, state)[1]
                 completion, inner = (self.values[slot], self.inner[slot]) if slot >= 0 else (0.0, 0.0)
                 found.append((value + inner, value + completion))
         return max(found, key=lambda pair: pair[0])
