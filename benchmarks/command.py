@@ -11,10 +11,10 @@ import jax
 from lodestone.devices import use_all_cores
 
 
-def run(description: str, title: str, measure: Callable[[int], dict[str, dict[str, float]]]) -> None:
-    """Measure with the number of seeds that was asked for, on all cores, and print a table or JSON."""
+def run(description: str, title: str, measure: Callable[[int], dict[str, dict[str, float]]], seeds: int = 512) -> None:
+    """Measure with the number of seeds that was asked for, or else `seeds`, on all cores; print a table or JSON."""
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=512, help="seeds trained at once (default: 512)")
+    parser.add_argument("--seeds", type=int, default=seeds, help=f"seeds trained at once (default: {seeds})")
     parser.add_argument("--json", action="store_true", help="print JSON")
     arguments = parser.parse_args()
     jax.config.update("jax_platforms", "cpu")

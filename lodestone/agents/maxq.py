@@ -12,14 +12,14 @@ R~ is what a subtask acts by; C without it is what its caller sees. *All-states 
 that the child went through. MAXQ-0 is the case without pseudo-rewards and without all-states updating.
 
 The recursion is unrolled into events, one at a time in every seed: a few states are updated, and, when none is left to
-update, a child is called, which may be a primitive action, or a subtask that has ended is left.
+update, children are called down to a primitive action, which acts, and what has ended is left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -27,16 +27,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, initial_state, next_step, sample_initial
+from lodestone.agents.q_learning import choose_among
+from lodestone.envs.base import Environment, initial_state, sample_initial
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
-from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import Rules
-from lodestone.planning.enumerated import enumerated
+from lodestone.options.execution import Rules, uniforms
+from lodestone.planning.enumerated import enumerated, look_up_step
 from lodestone.planning.tables import tabulate
+from lodestone.subtasks.places import arrange, may_be_running
 from lodestone.subtasks.recursive import polled_policy
 from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
+from lodestone.subtasks.values import Known, evaluator
 
 EVENTS_PER_ROUND = 32
 """Events between two looks at the schedules."""
@@ -74,107 +76,44 @@ class Learned(NamedTuple):
     such subtask."""
 
 
-class Hierarchy(NamedTuple):
-    """The stack of subtasks that run; D levels, the root is level 0."""
+class Stack(NamedTuple):
+    """The subtasks that run, by their places (`Places`): a caller's is above that of what it calls."""
 
-    depth: Int[Array, ""]
-    """The level that is up."""
-    subtask: Int[Array, " D"]
-    edge: Int[Array, " D"]
-    """The call that each level made last."""
-    called_at: Int[Array, " D"]
+    subtask: tuple[Int[Array, ""], ...]
+    """The subtask that runs at each place; -1 for none."""
+    edge: tuple[Int[Array, ""], ...]
+    """The call that was made last from each place."""
+    called_at: tuple[Int[Array, ""], ...]
     """The step of the episode at which it was made."""
+
+
+class Lesson(NamedTuple):
+    """What the last step has to teach: about the calls that ended with it, from the lowest place up."""
+
+    values: tuple[Float[Array, ""], ...]
+    """V of the caller at each place where the step led to; 0 if it has ended there."""
+    inner_values: tuple[Float[Array, ""], ...]
+    """max Q~, or the pseudo-reward; 0 where no subtask acts by one."""
+    updates: tuple[Int[Array, ""], ...]
+    """Updates of each place and those below."""
+    done: Int[Array, ""]
+    """Updates that have been made, or more."""
 
 
 class Carry(NamedTuple):
     """Everything that one seed carries from round to round."""
 
     learned: Learned
-    hierarchy: Hierarchy
+    stack: Stack
+    lesson: Lesson
     state: Int[Array, ""]
     visited: Int[Array, " L"]
     """The states of the episode."""
     steps: Int[Array, ""]
     """Steps of the episode."""
-    level: Int[Array, ""]
-    """The level whose call has ended and is being learned from."""
-    position: Int[Array, ""]
-    """The step whose state is updated next; below the step of the call where there is nothing to learn from."""
-    cut: Bool[Array, ""]
-    """Whether the episode was ended by a limit, and the stack is being left without learning."""
     episode_return: Float[Array, ""]
     total_steps: Int[Array, ""]
     key: PRNGKeyArray
-
-
-class Values(NamedTuple):
-    """What is known about one state."""
-
-    nodes: Float[Array, " A+T"]
-    """V of every action and subtask, pseudo-rewards left out."""
-    inner_edges: Float[Array, " E"]
-    """Q~ of every call; -inf where it is not allowed."""
-    inner_subtasks: Float[Array, " T"]
-    """max Q~ of every subtask, or its pseudo-reward where it has ended."""
-    choices: Int[Array, " T"]
-    """The edge with the largest Q~, the first of equals."""
-
-
-FORBIDDEN = -2
-"""In place of a slot: the call is not allowed."""
-
-
-class Arrays(NamedTuple):
-    """`TaskTables` on the device, the state first."""
-
-    completion_slot: Int[Array, "S E"]
-    """-1 where the completion is 0, `FORBIDDEN` where the call is not allowed."""
-    reward_slot: Int[Array, "S A"]
-    ends: Bool[Array, "S T"]
-    pseudo_rewards: Float[Array, "S T"]
-
-
-def on_device(tasks: TaskTables) -> Arrays:
-    """The arrays that `values_at` looks up."""
-    return Arrays(
-        completion_slot=jnp.asarray(np.where(tasks.available, tasks.completion_slot, FORBIDDEN).T),
-        reward_slot=jnp.asarray(tasks.reward_slot.T),
-        ends=jnp.asarray(tasks.ends.T),
-        pseudo_rewards=jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32),
-    )
-
-
-def values_at(tasks: TaskTables, arrays: Arrays, learned: Learned, state: Int[Array, ""]) -> Values:
-    """All values of one state, from the primitive actions up."""
-    slot, ends = arrays.completion_slot[state], arrays.ends[state]
-    completions = jnp.where(slot >= 0, learned.values[slot], 0.0)
-    acts_otherwise = [bool(rewards.any()) for rewards in tasks.pseudo_rewards]
-
-    # One number at a time rather than arrays of a subtask's children: the compiler makes one loop over seeds of it all.
-    nodes = dict(enumerate(learned.values[arrays.reward_slot[state]]))
-    inner_edges: list[Array] = [jnp.float32(-jnp.inf)] * len(tasks.edges)
-    inner_subtasks, choices = {}, {}
-    for subtask in tasks.bottom_up:
-        best_inner, best_value, choice = jnp.float32(-jnp.inf), jnp.float32(0), jnp.int32(0)
-        for number in tasks.edges_of(subtask):
-            below, inner_completion = nodes[tasks.edges[number].child], completions[number]
-            if acts_otherwise[subtask]:
-                inner_completion = jnp.where(slot[number] >= 0, learned.inner[slot[number]], 0.0)
-            inner = jnp.where(slot[number] != FORBIDDEN, below + inner_completion, -jnp.inf)
-            better = inner > best_inner
-            best_inner = jnp.where(better, inner, best_inner)
-            best_value = jnp.where(better, below + completions[number], best_value)
-            choice = jnp.where(better, number, choice)
-            inner_edges[number] = inner
-        nodes[tasks.num_actions + subtask] = jnp.where(ends[subtask], 0.0, best_value)
-        after_end = arrays.pseudo_rewards[state, subtask] if acts_otherwise[subtask] else jnp.float32(0)
-        inner_subtasks[subtask] = jnp.where(ends[subtask], after_end, best_inner)
-        choices[subtask] = choice
-
-    def ordered(found: dict[int, Array]) -> Array:
-        return jnp.stack([found[number] for number in sorted(found)])
-
-    return Values(ordered(nodes), jnp.stack(inner_edges), ordered(inner_subtasks), ordered(choices))
 
 
 def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: Rules, steps: int) -> Algorithm:
@@ -193,117 +132,168 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     limit = min(limits)
     tables = tabulate(environment)
     tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    world, arrays = enumerated(tables, environment.action_names), on_device(tasks)
-    with_pseudo_rewards = bool(tasks.pseudo_rewards.any())
-    num_actions, levels = tasks.num_actions, graph.levels
-    caller = jnp.asarray([edge.subtask for edge in tasks.edges], dtype=jnp.int32)
-    edges_of = _padded([tasks.edges_of(subtask) for subtask in range(len(tasks.ends))])
+    world, num_actions, num_edges = enumerated(tables, environment.action_names), tasks.num_actions, len(tasks.edges)
+    places = arrange(tasks, may_be_running(tasks, tables))
+    evaluate, top = evaluator(tasks, places), len(places.calls) - 1
+    draws = 1 + 2 * sum(edges.shape[1] > 1 for edges in places.calls)
+
+    # What a state and another number look up is flat: one index is put together far faster than two.
+    completion_slot = jnp.asarray(tasks.completion_slot.T.ravel())
+    reward_slot = jnp.asarray(tasks.reward_slot.T.ravel())
+    calls = [jnp.asarray(edges.ravel()) for edges in places.calls]
+    resident = jnp.asarray(places.resident)
+    pseudo_rewards = jnp.asarray(tasks.pseudo_rewards.T, dtype=jnp.float32)
+    stored = jnp.asarray((tasks.completion_slot >= 0).any(axis=1))
     child_of = jnp.asarray([edge.child for edge in tasks.edges], dtype=jnp.int32)
+    child_place = jnp.asarray([-1] * num_actions + list(places.place_of), dtype=jnp.int32)[child_of]
     powers = jnp.asarray(rules.discount ** np.arange(limit + 1), dtype=jnp.float32)
+
+    only_root = (jnp.int32(-1),) * top + (jnp.int32(0),)
+    no_numbers, no_values = (jnp.int32(0),) * (top + 1), (jnp.float32(0),) * (top + 1)
+    no_lesson = Lesson(no_values, no_values, no_numbers, jnp.int32(0))
 
     def init(key: PRNGKeyArray) -> Carry:
         start_key, key = jax.random.split(key)
-        zeros, none = jnp.zeros(tasks.num_slots), jnp.zeros(levels, dtype=jnp.int32)
+        zeros = jnp.zeros(tasks.num_slots)
         return Carry(
-            learned=Learned(zeros, zeros if with_pseudo_rewards else jnp.zeros(0)),
-            hierarchy=Hierarchy(jnp.int32(0), none, none, none),
+            learned=Learned(zeros, zeros if any(places.otherwise) else jnp.zeros(0)),
+            stack=Stack(only_root, no_numbers, no_numbers),
+            lesson=no_lesson,
             state=sample_initial(world, start_key),
             visited=jnp.zeros(limit, dtype=jnp.int32),
             steps=jnp.int32(0),
-            level=jnp.int32(0),
-            position=jnp.int32(-1),
-            cut=jnp.bool_(False),
             episode_return=jnp.float32(0),
             total_steps=jnp.int32(0),
             key=key,
         )
 
-    def event(
-        carry: Carry, noise: Float[Array, "4"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
-    ) -> tuple[Carry, RoundLog]:
-        """Update some states if a call has ended; if all are done, return from a subtask that has ended; else call a
-        child, which, if it is a primitive action, acts."""
-        hierarchy, state, steps = carry.hierarchy, carry.state, carry.steps
-        known, ends = values_at(tasks, arrays, carry.learned, state), arrays.ends[state]
-
-        edge, first = hierarchy.edge[carry.level], hierarchy.called_at[carry.level]
-        value, inner_value = known.nodes[num_actions + caller[edge]], known.inner_subtasks[caller[edge]]
-        position, (values, inner), loss = carry.position, carry.learned, jnp.float32(0)
-        for _ in range(UPDATES_PER_EVENT if config.all_states else 1):
-            due = position >= first
-            slot = jnp.where(due, arrays.completion_slot[carry.visited[position], edge], -1)
-            weight = powers[steps - position]
-            values, error = _move(values, slot, weight * value, learning_rate)
-            if with_pseudo_rewards:
-                inner, _ = _move(inner, slot, weight * inner_value, learning_rate)
+    def update(carry: Carry, learning_rate: Float[Array, ""]) -> tuple[Learned, Float[Array, ""]]:
+        """The next updates of the lesson, those of the latest states first; returns the sum of squared errors, too."""
+        (values, inner), stack, lesson = carry.learned, carry.stack, carry.lesson
+        loss = jnp.float32(0)
+        for offset in range(UPDATES_PER_EVENT if config.all_states else 1):
+            number = lesson.done + offset
+            at_place = partial(_first_above, number, lesson.updates)
+            back = number - at_place((0, *lesson.updates[:-1]))
+            position = carry.steps - 1 - back if config.all_states else at_place(stack.called_at)
+            slot = completion_slot[carry.visited[position] * num_edges + at_place(stack.edge)]
+            slot = jnp.where(number < lesson.updates[top], slot, -1)
+            weight = powers[carry.steps - position]
+            values, error = _move(values, slot, weight * at_place(lesson.values), learning_rate)
+            if any(places.otherwise):
+                slot = jnp.where(at_place(places.otherwise), slot, -1)
+                inner, _ = _move(inner, slot, weight * at_place(lesson.inner_values), learning_rate)
             loss += jnp.square(error)
-            position -= due.astype(jnp.int32)
+        return Learned(values, inner), loss
 
-        up, subtask = hierarchy.depth, hierarchy.subtask[hierarchy.depth]
-        updating = position >= first
-        ended = ends[hierarchy.subtask] & (jnp.arange(levels) <= up)
-        returning = ~updating & (jnp.any(ended) | carry.cut)
-        calling = ~updating & ~returning
-        episode_over = returning & (up == 0)
+    def descend(
+        carry: Carry, known: list[Known], noise: Float[Array, " N"], epsilon: Float[Array, ""]
+    ) -> tuple[Stack, Int[Array, ""]]:
+        """Calls down to a primitive action; returns the place that calls it, too."""
+        subtask, edge, called_at = (list(leaf) for leaf in carry.stack)
+        caller, uniform = jnp.int32(top), iter(noise)
+        for place in reversed(range(top)):
+            caller = jnp.where(subtask[place] >= 0, place, caller)
+        for place in reversed(range(top + 1)):
+            here, values, choice = caller == place, known[place].inner_calls, jnp.int32(0)
+            if len(values) > 1:
+                choice = choose_among(next(uniform), next(uniform), values, epsilon)
+            call = calls[place][carry.state * len(values) + choice]
+            edge[place] = jnp.where(here, call, edge[place])
+            called_at[place] = jnp.where(here, carry.steps, called_at[place])
+            for lower in range(place):
+                entered = here & (child_place[call] == lower)
+                subtask[lower] = jnp.where(entered, child_of[call] - num_actions, subtask[lower])
+                caller = jnp.where(entered, lower, caller)
+        return Stack(tuple(subtask), tuple(edge), tuple(called_at)), caller
 
-        edges = edges_of[subtask]
-        row = jnp.where(edges >= 0, known.inner_edges[edges], -jnp.inf)
-        choice = edges[epsilon_greedy(noise[:2], row, row > -jnp.inf, epsilon)]
-        child = child_of[choice]
-        acting = calling & (child < num_actions)
-        descending = calling & ~acting
-        action = jnp.minimum(child, num_actions - 1)
-        step = next_step(world, noise[2], state, action)
-        terminated = step.terminated | arrays.ends[step.state, 0]  # the root may end before the environment does
-        cut = acting & (steps + 1 >= limit) & ~terminated
-        values, error = _move(
-            values, jnp.where(acting, arrays.reward_slot[state, action], -1), step.reward, learning_rate
+    def arrive(
+        stack: Stack, caller: Int[Array, ""], steps: Int[Array, ""], state: Int[Array, ""], learned: Learned
+    ) -> tuple[Stack, Lesson]:
+        """What is left of the stack after a step, and what is learned. `caller` is the place that called the action.
+
+        A call is learned from when it has ended by itself, not when a subtask above it has. All values can be known
+        before the first update, as none of them depends on it: they are those of callers whose calls have ended.
+        """
+        known, residents = evaluate(*learned, state), resident[state]
+        cut = (steps >= limit) & (residents[top] >= 0)
+        running = [subtask >= 0 for subtask in stack.subtask]
+        ended = [runs & (residents[place] != stack.subtask[place]) for place, runs in enumerate(running)]
+        values, inner_values, updates, total = [], [], [], jnp.int32(0)
+        call_ended = jnp.bool_(False)
+        for place in range(top + 1):
+            values.append(jnp.where(ended[place], 0.0, known[place].value))
+            inner_value = jnp.float32(0)
+            if places.otherwise[place]:
+                after_end = pseudo_rewards[state, stack.subtask[place]]
+                inner_value = jnp.where(ended[place], after_end, known[place].inner_value)
+            inner_values.append(inner_value)
+            learns = ((caller == place) | (running[place] & call_ended & ~cut)) & stored[stack.edge[place]]
+            length = steps - stack.called_at[place] if config.all_states else jnp.int32(1)
+            total += jnp.where(learns, length, 0)
+            updates.append(total)
+            call_ended = jnp.where(running[place], ended[place], call_ended)
+        subtask, left = list(stack.subtask), cut
+        for place in reversed(range(top + 1)):
+            left |= ended[place]
+            subtask[place] = jnp.where(left, -1, subtask[place])
+        lesson = Lesson(tuple(values), tuple(inner_values), tuple(updates), jnp.int32(0))
+        return stack._replace(subtask=tuple(subtask)), lesson
+
+    def event(
+        carry: Carry, noise: Float[Array, " N"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
+    ) -> tuple[Carry, RoundLog]:
+        """Some updates; if none is left, an action, or a new episode where the root has been left."""
+        state = carry.state
+        # Written before it is read, or else the compiler copies it all.
+        carry = carry._replace(visited=carry.visited.at[carry.steps].set(state, mode="drop"))
+        learned, loss = update(carry, learning_rate)
+        done = carry.lesson.done + (UPDATES_PER_EVENT if config.all_states else 1)
+        ready = done >= carry.lesson.updates[top]
+        # The root has been left, or had ended where the episode began.
+        over = (carry.stack.subtask[top] < 0) | (resident[state, top] < 0)
+        acting = ready & ~over
+
+        stack, caller = descend(carry, evaluate(*learned, state), noise, epsilon)
+        edge = _at(caller, stack.edge)
+        action = jnp.minimum(child_of[edge], num_actions - 1)
+        step = look_up_step(world, noise[-1], state, action)
+        slot = jnp.where(acting, reward_slot[state * num_actions + action], -1)
+        values, error = _move(learned.values, slot, step.reward, learning_rate)
+        learned = learned._replace(values=values)
+        steps = carry.steps + 1
+        left, lesson = arrive(stack, caller, steps, step.state, learned)
+        terminated = resident[step.state, top] < 0  # the root may end before the environment does
+
+        acted = carry._replace(
+            stack=left,
+            lesson=lesson,
+            state=step.state,
+            steps=steps,
+            episode_return=carry.episode_return + step.reward,
+            total_steps=carry.total_steps + 1,
         )
-
-        # A call is learned from when it has ended by itself, not when a subtask above it has.
-        from_child = returning & ~episode_over & ends[subtask] & ~carry.cut
-        level = jnp.where(acting, up, jnp.where(returning, up - 1, carry.level))
-        last = jnp.where(acting, steps, steps - 1)
-        if not config.all_states:
-            last = jnp.where(acting, steps, hierarchy.called_at[jnp.maximum(up - 1, 0)])
-        position = jnp.where(acting | from_child, last, jnp.where(updating, position, -1))
-
-        called = jnp.arange(levels) == jnp.where(calling, up, levels)
-        entered = jnp.arange(levels) == jnp.where(descending, up + 1, levels)
-        after = Hierarchy(
-            depth=jnp.where(episode_over, 0, up + descending.astype(jnp.int32) - returning.astype(jnp.int32)),
-            subtask=jnp.where(entered, child - num_actions, hierarchy.subtask),
-            edge=jnp.where(called, choice, hierarchy.edge),
-            called_at=jnp.where(called, steps, hierarchy.called_at),
+        restarted = carry._replace(
+            stack=carry.stack._replace(subtask=only_root),
+            lesson=no_lesson,
+            state=initial_state(world, noise[-1]),
+            steps=jnp.int32(0),
+            episode_return=jnp.float32(0),
         )
-        moved = jnp.where(acting, step.state, state)
-        total = jnp.where(acting, carry.episode_return + step.reward, carry.episode_return)
-        taken = steps + acting.astype(jnp.int32)
-        next_carry = Carry(
-            learned=Learned(values, inner),
-            hierarchy=after,
-            state=jnp.where(episode_over, initial_state(world, noise[3]), moved),
-            visited=carry.visited.at[jnp.where(acting, steps, limit)].set(state, mode="drop"),
-            steps=jnp.where(episode_over, 0, taken),
-            level=level,
-            position=position,
-            cut=(carry.cut | cut) & ~episode_over,
-            episode_return=jnp.where(episode_over, 0.0, total),
-            total_steps=carry.total_steps + acting.astype(jnp.int32),
-            key=carry.key,
-        )
+        waiting = carry._replace(lesson=carry.lesson._replace(done=done))
+        next_carry = _select(acting, acted, _select(ready, restarted, waiting))
         log = RoundLog(
             valid=acting,
-            option=choice,
+            option=edge,
             steps=jnp.int32(1),
-            episode_ended=terminated | cut,
+            episode_ended=left.subtask[top] < 0,
             terminated=terminated,
-            episode_return=total,
-            episode_steps=taken,
-            episode_decisions=taken,
+            episode_return=acted.episode_return,
+            episode_steps=steps,
+            episode_decisions=steps,
             loss=loss + jnp.square(error),
         )
-        return next_carry, log
+        return next_carry._replace(learned=learned), log
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`EVENTS_PER_ROUND` events."""
@@ -312,7 +302,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         epsilon = piecewise_linear(config.epsilon, fraction)
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         noise_key, key = jax.random.split(carry.key)
-        noise = jax.random.uniform(noise_key, (EVENTS_PER_ROUND, 4))
+        noise = uniforms(noise_key, (EVENTS_PER_ROUND, draws))
         carry, log = jax.lax.scan(lambda carry, noise: event(carry, noise, epsilon, learning_rate), carry, noise)
         return carry._replace(key=key), log._replace(loss=jnp.mean(log.loss))
 
@@ -327,6 +317,24 @@ def _move(
     return values.at[slot].add(learning_rate * error), error
 
 
+def _at(place: Int[Array, ""], numbers: Sequence[Array]) -> Array:
+    """The number of a place, by comparisons: of a few that is faster than a look-up."""
+    return reduce(lambda found, one: jnp.where(place == one[0], one[1], found), enumerate(numbers), numbers[0])
+
+
+def _first_above(number: Int[Array, ""], bounds: Sequence[Array], options: Sequence[Array | int]) -> Array:
+    """The option of the first place whose bound is above a number; of the last place if none is."""
+    found = jnp.asarray(options[-1])
+    for bound, option in zip(bounds[-2::-1], options[-2::-1], strict=True):
+        found = jnp.where(number < bound, option, found)
+    return found
+
+
+def _select(condition: Bool[Array, ""], one: Carry, other: Carry) -> Carry:
+    """What differs between two, entry by entry."""
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), one, other)
+
+
 def as_configured(config: MAXQConfig, graph: TaskGraph) -> TaskGraph:
     """The graph with as much abstraction and as many pseudo-rewards as the learner uses."""
     graph = graph if config.abstraction else graph.without_abstraction()
@@ -338,9 +346,25 @@ def chooser(
 ) -> Callable[[Learned], Int[np.ndarray, "N T S"]]:
     """A function from what N seeds have learned to the edge that each subtask takes in each state; -1 where it has
     ended. Compiled once."""
-    tasks, everywhere = _everywhere(config, environment, graph)
-    ask = jax.jit(jax.vmap(everywhere))
-    return lambda learned: np.where(tasks.ends, -1, np.asarray(ask(learned).choices).swapaxes(1, 2))
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
+    places = arrange(tasks, ~tasks.ends)
+    evaluate, states = evaluator(tasks, places), np.arange(tables.num_states)
+
+    @jax.jit
+    def best(learned: Learned) -> list[Int[Array, "N S"]]:
+        def of_state(learned: Learned, state: Int[Array, ""]) -> list[Int[Array, ""]]:
+            return [known.best for known in evaluate(*learned, state)]
+
+        each_state = jax.vmap(of_state, in_axes=(None, 0))
+        return jax.vmap(each_state, in_axes=(0, None))(learned, jnp.asarray(states))
+
+    def choose_edges(learned: Learned) -> Int[np.ndarray, "N T S"]:
+        found = best(jax.tree.map(jnp.asarray, learned))
+        chosen = [places.calls[place][states, np.asarray(found[place])] for place in places.place_of]
+        return np.where(tasks.ends, -1, np.stack(chosen, axis=1))
+
+    return choose_edges
 
 
 def polled_values(
@@ -349,24 +373,20 @@ def polled_values(
     """What each of N seeds expects of each primitive action where every step asks anew from the root down: the rewards
     and completions along the best path to the action, -inf where there is none. The maximum of a row is the action that
     polling takes, also where pseudo-rewards choose another path than the best."""
-    tasks, everywhere = _everywhere(config, environment, graph)
-    values = jax.tree.map(np.asarray, jax.jit(jax.vmap(everywhere))(jax.tree.map(jnp.asarray, learned)))
-    seeds = zip(np.asarray(learned.values), values.nodes, values.choices, strict=True)
-    return np.stack([_polled_values(tasks, *seed) for seed in seeds])
+    tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
+    choices = chooser(config, environment, graph)(learned)
+    return np.stack([_polled_values(tasks, *seed) for seed in zip(np.asarray(learned.values), choices, strict=True)])
 
 
 def _polled_values(
-    tasks: TaskTables,
-    stored: Float[np.ndarray, " slots"],
-    nodes: Float[np.ndarray, "S A+T"],
-    choices: Int[np.ndarray, "S T"],
+    tasks: TaskTables, stored: Float[np.ndarray, " slots"], choices: Int[np.ndarray, "T S"]
 ) -> Float[np.ndarray, "S A"]:
     states = np.arange(tasks.ends.shape[1])
     slots = tasks.completion_slot
     completions = np.where(slots >= 0, stored[slots], 0.0)
     paths = {action: np.full((len(states), tasks.num_actions), -np.inf) for action in range(tasks.num_actions)}
     for action, path in paths.items():
-        path[:, action] = nodes[:, action]
+        path[:, action] = stored[tasks.reward_slot[action]]
     for subtask in tasks.bottom_up:
         calls = [
             np.where(tasks.available[number], completions[number], -np.inf)[:, None] + paths[tasks.edges[number].child]
@@ -374,32 +394,12 @@ def _polled_values(
         ]
         paths[tasks.num_actions + subtask] = np.max(calls, axis=0)
     found = np.where(tasks.ends[0][:, None], 0.0, paths[tasks.num_actions])
-    polled = polled_policy(tasks, np.where(tasks.ends, -1, choices.T))
+    polled = polled_policy(tasks, choices)
     found[states, polled] = np.nextafter(found.max(axis=1).astype(np.float32), np.float32(np.inf))
     return found.astype(np.float32)
 
 
-def _everywhere(
-    config: MAXQConfig, environment: Environment, graph: TaskGraph
-) -> tuple[TaskTables, Callable[[Learned], Values]]:
-    """The tasks, and a function from what one seed has learned to what it knows about every state."""
-    tables = tabulate(environment)
-    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    arrays = on_device(tasks)
-
-    def everywhere(learned: Learned) -> Values:
-        return jax.vmap(partial(values_at, tasks, arrays, learned))(jnp.arange(tables.num_states))
-
-    return tasks, everywhere
-
-
 def rounds_for(graph: TaskGraph, steps: int) -> int:
-    """Rounds that are surely enough for so many primitive steps: an action takes an event to be called and one to be
-    learned from, and every level above it at most a call, a return and an update a step."""
-    return -(-steps * (2 + 3 * (graph.levels - 1)) // EVENTS_PER_ROUND)
-
-
-def _padded(rows: list[tuple[int, ...]]) -> Int[Array, "T U"]:
-    """Rows of one length, filled up with -1."""
-    width = max(map(len, rows))
-    return jnp.asarray([row + (-1,) * (width - len(row)) for row in rows], dtype=jnp.int32)
+    """Rounds that are surely enough for so many primitive steps: an event acts, begins an episode, or makes an update,
+    of which a step brings at most one a level."""
+    return -(-steps * (2 + graph.levels) // EVENTS_PER_ROUND)

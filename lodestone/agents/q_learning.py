@@ -71,9 +71,7 @@ def update(
 def largest(row: Float[Array, " O"]) -> Float[Array, ""]:
     """The maximum of a row. A short one is gone through entry by entry: where many seeds learn side by side that is one
     loop over them, and a reduction is several."""
-    if row.size > UNROLLED:
-        return jnp.max(row)
-    return reduce(lambda one, other: jnp.where(one > other, one, other), list(row))
+    return _largest(list(row)) if row.size <= UNROLLED else jnp.max(row)
 
 
 def choose(
@@ -82,10 +80,20 @@ def choose(
     """What `epsilon_greedy` chooses, entry by entry as in `largest`."""
     if values.size > UNROLLED:
         return epsilon_greedy(uniform, values, available, epsilon)
-    row = mask_unavailable(values, available)
-    least = jnp.where(uniform[0] < epsilon, jnp.finfo(jnp.float32).min, largest(row))
-    counts = list(accumulate(jnp.where(value >= least, 1.0, 0.0) for value in row))
-    return sum((count <= uniform[1] * counts[-1]).astype(jnp.int32) for count in counts[:-1]) + jnp.int32(0)
+    return choose_among(uniform[0], uniform[1], list(mask_unavailable(values, available)), epsilon)
+
+
+def choose_among(
+    explores: Float[Array, ""], picks: Float[Array, ""], values: list[Float[Array, ""]], epsilon: Float[Array, ""]
+) -> Int[Array, ""]:
+    """The same for a few values that are no array; -inf where there is nothing to choose."""
+    least = jnp.where(explores < epsilon, jnp.finfo(jnp.float32).min, _largest(values))
+    counts = list(accumulate(jnp.where(value >= least, 1.0, 0.0) for value in values))
+    return sum((count <= picks * counts[-1]).astype(jnp.int32) for count in counts[:-1]) + jnp.int32(0)
+
+
+def _largest(values: list[Float[Array, ""]]) -> Float[Array, ""]:
+    return reduce(lambda one, other: jnp.where(one > other, one, other), values)
 
 
 def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...]:

@@ -33,7 +33,7 @@ JUDGED_STEPS = 50
 """Steps after which a greedy policy is stopped: the optimum takes 18 at most."""
 
 ABSTRACT, WHOLE, FLAT = "MAXQ-Q, abstraction", "MAXQ-Q, whole states", "Q-learning, flat"
-EPSILON = ((0.0, 0.3), (0.8, 0.3), (1.0, 0.02))
+EPSILON = ((0.0, 0.5), (0.8, 0.5), (1.0, 0.02))
 CONFIGS: dict[str, MAXQConfig | QLearningConfig] = {
     ABSTRACT: MAXQConfig(learning_rate=((0.0, 0.25),), epsilon=EPSILON),
     WHOLE: MAXQConfig(learning_rate=((0.0, 0.5),), epsilon=EPSILON, abstraction=False),

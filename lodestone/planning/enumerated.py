@@ -74,6 +74,11 @@ def enumerated(tables: Tables, action_names: tuple[str, ...]) -> Enumerated:
 
 def look_up_step(world: Enumerated, uniform: Float[Array, ""], state: Int[Array, ""], action: Int[Array, ""]) -> Step:
     """What `next_step` does, without a search for the draw that led to the next state."""
-    outcome = inverse_cdf(world.probs[state, action], uniform) if world.num_outcomes > 1 else jnp.int32(0)
-    next_state = world.successors[state, action, outcome]
-    return Step(next_state, world.rewards[state, action, outcome], world.ends[next_state])
+    # One index rather than three: the compiler would first put several together in memory.
+    pair = state * world.num_actions + action
+    outcome = jnp.int32(0)
+    if world.num_outcomes > 1:
+        outcome = inverse_cdf(world.probs.reshape(-1, world.num_outcomes)[pair], uniform)
+    triple = pair * world.num_outcomes + outcome
+    next_state = world.successors.ravel()[triple]
+    return Step(next_state, world.rewards.ravel()[triple], world.ends[next_state])

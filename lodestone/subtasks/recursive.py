@@ -27,7 +27,7 @@ from lodestone.planning.solve import (
     iterate_values,
 )
 from lodestone.planning.tables import Tables, state_text
-from lodestone.subtasks.task_graph import TaskTables
+from lodestone.subtasks.task_graph import TaskTables, actions_below
 
 ABSTRACTION_TOLERANCE = 1e-6
 """How far apart values may be that are stored as one."""
@@ -232,7 +232,7 @@ def _require_nested_ends(tasks: TaskTables, tables: Tables) -> None:
         child = edge.child - tasks.num_actions
         if child < 0:
             continue
-        actions = sorted(_actions_below(tasks, child))
+        actions = sorted(actions_below(tasks, child))
         reached = found = tasks.available[number]
         while found.any():
             following = np.zeros_like(reached)
@@ -247,9 +247,3 @@ def _require_nested_ends(tasks: TaskTables, tables: Tables) -> None:
                 f"Subtask {tasks.names[edge.child]!r} may go on when {caller!r}, which called it, has ended: in "
                 f"{state_text(tables.space, int(outlived.argmax()))}. Let it end there, too."
             )
-
-
-def _actions_below(tasks: TaskTables, subtask: int) -> set[int]:
-    children = {edge.child for edge in tasks.edges if edge.subtask == subtask}
-    actions = {child for child in children if child < tasks.num_actions}
-    return actions.union(*(_actions_below(tasks, child - tasks.num_actions) for child in children - actions))

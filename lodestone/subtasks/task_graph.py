@@ -237,6 +237,13 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
     )
 
 
+def actions_below(tasks: TaskTables, subtask: int) -> set[int]:
+    """The primitive actions that a subtask, or what it calls, may take."""
+    children = {edge.child for edge in tasks.edges if edge.subtask == subtask}
+    actions = {child for child in children if child < tasks.num_actions}
+    return actions.union(*(actions_below(tasks, child - tasks.num_actions) for child in children - actions))
+
+
 def _answers(graph: TaskGraph, tables: Tables) -> dict[Callable[[State], Array], np.ndarray]:
     """What each of the graph's functions answers in every state; all of them are one compilation."""
     asked = list(graph.rewards_see.values())

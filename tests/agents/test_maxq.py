@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from lodestone.planning.solve import evaluate_policy
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
 from lodestone.subtasks.recursive import evaluate_choices, recursive_optimum
-from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph, tabulate_tasks
+from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph, TaskTables, tabulate_tasks
 
 EXPLORING = ((0.0, 0.5), (1.0, 0.3))
 DECAYING = ((0.0, 0.5), (0.5, 0.5), (1.0, 0.01))
@@ -133,3 +134,86 @@ def test_a_limit_teaches_nothing_about_the_calls_that_it_cuts():
     assert (learned.values[slots[slots >= 0]] == 0).all()
     rewards = tasks.reward_slot[rooms.action_names.index("north")]
     assert learned.values[rewards[rewards >= 0]].min() < -0.2
+
+
+class Recursion:
+    """MAXQ-Q as it is written down, for one seed, on the experience of another learner.
+
+    `calls` holds the edge that a subtask took at a step, `states` the states of the episode.
+    """
+
+    def __init__(self, tasks: TaskTables, discount: float, learning_rate: float, all_states: bool) -> None:
+        self.tasks, self.discount, self.learning_rate, self.all_states = tasks, discount, learning_rate, all_states
+        self.values, self.inner = np.zeros(tasks.num_slots), np.zeros(tasks.num_slots)
+
+    def best(self, subtask: int, state: int) -> tuple[float, float]:
+        """(Q~, Q) of the child with the largest Q~."""
+        found = []
+        for number in self.tasks.edges_of(subtask):
+            if self.tasks.available[number, state]:
+                child, slot = self.tasks.edges[number].child, self.tasks.completion_slot[number, state]
+                below = child - self.tasks.num_actions
+                value = self.values[self.tasks.reward_slot[child, state]] if below < 0 else self.best(below, state)[1]
+                completion, inner = (self.values[slot], self.inner[slot]) if slot >= 0 else (0.0, 0.0)
+                found.append((value + inner, value + completion))
+        return max(found, key=lambda pair: pair[0])
+
+    def run(self, subtask: int, step: int, calls: dict, states: list[int], rewards: list[float], cut: bool) -> int:
+        """From a step until the subtask, or one above it, has ended; the step at which it has."""
+        tasks = self.tasks
+        while step < len(rewards) and not tasks.ends[subtask, states[step]]:
+            edge, began = calls[subtask, step], step
+            child = tasks.edges[edge].child - tasks.num_actions
+            if child < 0:
+                slot = tasks.reward_slot[tasks.edges[edge].child, states[step]]
+                self.values[slot] += self.learning_rate * (rewards[step] - self.values[slot])
+                step += 1
+            else:
+                step = self.run(child, step, calls, states, rewards, cut)
+                if (cut and step == len(rewards)) or not tasks.ends[child, states[step]]:
+                    return step
+            inner, value = tasks.pseudo_rewards[subtask, states[step]], 0.0
+            if not tasks.ends[subtask, states[step]]:
+                inner, value = self.best(subtask, states[step])
+            for visited in reversed(range(began, step)) if self.all_states else [began]:
+                slot, weight = tasks.completion_slot[edge, states[visited]], self.discount ** (step - visited)
+                if slot >= 0:
+                    self.values[slot] += self.learning_rate * (weight * value - self.values[slot])
+                    self.inner[slot] += self.learning_rate * (weight * inner - self.inner[slot])
+        return step
+
+
+@pytest.mark.parametrize("all_states", [True, False], ids=["all states", "one state"])
+@pytest.mark.parametrize("environment", [Taxi(move_success=0.8), TwoRooms()], ids=["taxi", "two rooms"])
+def test_the_recursion_learns_the_same(monkeypatch, environment, all_states):
+    """Every value, after 1500 events, from the same steps; episodes are cut after 40, so that stacks are unwound."""
+    monkeypatch.setattr("lodestone.agents.maxq.EVENTS_PER_ROUND", 1)
+    config, graph = MAXQConfig(((0.0, 0.5),), ((0.0, 0.3),), all_states=all_states), task_graph(environment)
+    tables = tabulate(environment)
+    tasks = tabulate_tasks(graph, environment, tables)
+    plain = Recursion(tasks, 0.9, 0.5, all_states)
+    algorithm = maxq(config, environment, graph, Rules(discount=0.9, step_limit=40), 1000)
+    run_event = jax.jit(algorithm.run_round)
+    carry = algorithm.init(jax.random.key(0))
+    calls, states, rewards, episodes, cuts = {}, [int(carry.state)], [], 0, 0
+    while episodes < 50:
+        step, before = int(carry.steps), float(carry.episode_return)
+        carry, log = run_event(carry, jnp.int32(0))
+        if log.valid[0]:
+            for edge, called_at in zip(carry.stack.edge, carry.stack.called_at, strict=True):
+                if called_at == step:
+                    calls[tasks.edges[int(edge)].subtask, step] = int(edge)
+            states.append(int(carry.state))
+            rewards.append(float(log.episode_return[0]) - before)
+            over, terminated = bool(log.episode_ended[0]), bool(log.terminated[0])
+        elif rewards and not carry.steps:
+            assert over
+            plain.run(0, 0, calls, states, rewards, cut=not terminated)
+            episodes, cuts = episodes + 1, cuts + (not terminated)
+            np.testing.assert_allclose(carry.learned.values, plain.values, atol=1e-4)
+            calls, states, rewards = {}, [int(carry.state)], []
+    assert 0 < cuts < episodes
+    begins_otherwise = tasks.completion_slot[[tasks.pseudo_rewards[edge.subtask].any() for edge in tasks.edges]]
+    slots = np.unique(begins_otherwise[begins_otherwise >= 0])
+    np.testing.assert_allclose(carry.learned.inner[slots], plain.inner[slots], atol=1e-4)
+    assert np.abs(plain.inner[slots] - plain.values[slots]).max() > 1

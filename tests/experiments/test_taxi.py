@@ -8,9 +8,6 @@ import pytest
 from lodestone.experiments import taxi
 from lodestone.learning.progress import Silent
 
-LATE = f"greedy return after 1600 episodes, {taxi.ABSTRACT}"
-"""Measured as 7.90 where 7.93 is required: docs/hierarchies.md."""
-
 
 def test_a_short_run_is_judged_within_its_limits(monkeypatch):
     monkeypatch.setattr(taxi, "STEPS", dict.fromkeys(taxi.STEPS, 2000))
@@ -26,8 +23,5 @@ def test_a_short_run_is_judged_within_its_limits(monkeypatch):
 
 
 @pytest.mark.slow
-def test_all_numbers_come_out_but_one():
-    gates = {gate.name: gate for gate in taxi.run(20, Silent()).gates}
-    assert LATE in gates
-    assert [name for name, gate in gates.items() if not gate.passed] in ([], [LATE])
-    assert gates[LATE].measured > 7.8
+def test_all_numbers_come_out():
+    assert [gate.name for gate in taxi.run(20, Silent()).gates if not gate.passed] == []
