@@ -54,7 +54,7 @@ CONFIG = UnitedConfig(
     learning_starts=10_000,
     updates_per_round=4,
 )
-STEPS = 150_000
+STEPS = 100_000
 """Primitive steps of every run, per seed."""
 THRESHOLD = 50.0
 """Mean return whose first crossing is compared."""
