@@ -62,6 +62,8 @@ CHAIN_CONFIGS: dict[str, HDQNConfig | QLearningConfig] = {
     NETWORKS: replace(_CHAIN_CONFIG, network=replace(_CHAIN_CONFIG.network, hidden=(64,))),
     Q_LEARNING: QLearningConfig(learning_rate=((0.0, 0.1), (0.4, 0.05)), epsilon=((0.0, 1.0), (0.4, 0.1), (1.0, 0.05))),
 }
+HURRY = 0.99
+"""Discount of the exact controllers that the learned ones are held against."""
 LAST = 0.2
 """Share of a run's episodes whose mean return is the one that training is judged by."""
 
@@ -254,10 +256,6 @@ def _best_over_goals(tables: Tables, paid: Tables, environment: Environment) -> 
     subgoals = [arrival(tables, goal, HURRY) for goal in goals(environment)]
     controllers = tabulate_options(subgoal_options(tables, subgoals, HURRY), tables.space)
     return paid.initial_mean(option_value_iteration(paid, controllers, 1.0).values)
-
-
-HURRY = 0.99
-"""Discount of the exact controllers."""
 
 
 def _chain_panel(followed: dict[str, Followed]) -> Panel:
