@@ -38,7 +38,7 @@ from lodestone.options.catalogue import goals, option_names, scripted_options
 from lodestone.options.execution import Rules
 from lodestone.options.subgoals import arrival, subgoal_options
 from lodestone.planning.option_models import evaluate_options, option_value_iteration, tabulate_options
-from lodestone.planning.solve import evaluate_policy, value_iteration
+from lodestone.planning.solve import evaluate_policy, optimum
 from lodestone.planning.tables import Tables, tabulate
 from lodestone.types import State
 
@@ -62,6 +62,8 @@ CHAIN_CONFIGS: dict[str, HDQNConfig | QLearningConfig] = {
     NETWORKS: replace(_CHAIN_CONFIG, network=replace(_CHAIN_CONFIG.network, hidden=(64,))),
     Q_LEARNING: QLearningConfig(learning_rate=((0.0, 0.1), (0.4, 0.05)), epsilon=((0.0, 1.0), (0.4, 0.1), (1.0, 0.05))),
 }
+HURRY = 0.99
+"""Discount of the exact controllers that the learned ones are held against."""
 LAST = 0.2
 """Share of a run's episodes whose mean return is the one that training is judged by."""
 
@@ -122,11 +124,9 @@ class Tower:
 
 def run(seeds: int, progress: Progress) -> Study:
     """The chain on all seeds; the tower, which takes a hundred times as long, on half of them."""
-    tables = tabulate(CHAIN)
     followed = {name: _follow(name, seeds, progress) for name in CHAIN_CONFIGS}
     towers = {name: _build(name, max(1, seeds // 2), progress) for name in arm_learners()}
-    optimum = tables.initial_mean(value_iteration(tables, 1.0).values)
-    best_steps = _fewest_steps()
+    best_steps = optimum(ARM).optimal_steps
     return Study(
         name=EXPERIMENT.name,
         title=EXPERIMENT.title,
@@ -137,9 +137,9 @@ def run(seeds: int, progress: Progress) -> Study:
             "goals are: a brick in hand beside a tower of one or two, a standing tower of two or three."
         ),
         seeds=seeds,
-        panels=(_chain_panel(followed, optimum), _tower_panel(towers, ARM.tower_reward - best_steps)),
+        panels=(_chain_panel(followed), _tower_panel(towers)),
         tables=(
-            _exact_values(optimum),
+            _exact_values(),
             NumberTable(
                 f"Chain, {seeds} seeds, {CHAIN_STEPS:,} steps",
                 ("", "return in training, mean", "worst seed", "greedy return, mean", "worst seed", "seconds"),
@@ -237,45 +237,42 @@ def _build(name: str, seeds: int, progress: Progress) -> Tower:
     return Tower(history, np.asarray(episodes.steps), np.asarray(episodes.success))
 
 
-def _fewest_steps() -> float:
-    tables = tabulate(ARM)
-    return -tables.initial_mean(value_iteration(tables.with_step_reward(-1.0), 1.0).values)
-
-
-def _exact_values(optimum: float) -> NumberTable:
-    """What can be reached at all."""
+def _exact_values() -> NumberTable:
+    """What can be reached at all, and what with exact controllers."""
     chain, arm = tabulate(CHAIN), tabulate(ARM)
-    rows: list[tuple[str | float, ...]] = [
-        ("chain, actions: return", round(optimum, 6)),
-        ("chain, goals with exact controllers: return", round(_best_over_goals(chain, goals(CHAIN), 1.0), 6)),
-        ("tower, actions: steps", _fewest_steps()),
-    ]
     steps = arm.with_step_reward(-1.0)
-    controllers = subgoal_options(arm, [arrival(arm, goal, 0.97) for goal in goals(ARM)], 0.97)
-    over_goals = option_value_iteration(steps, tabulate_options(controllers, arm.space), 1.0)
-    rows.append(("tower, goals with exact controllers: steps", -steps.initial_mean(over_goals.values)))
-    return NumberTable("Exact values", ("", "best"), tuple(rows))
+    return NumberTable(
+        "Exact values",
+        ("", "actions", "goals with exact controllers"),
+        (
+            ("chain: return", optimum(CHAIN).optimal_return, _best_over_goals(chain, chain, CHAIN)),
+            ("tower: steps", optimum(ARM).optimal_steps, -_best_over_goals(arm, steps, ARM)),
+        ),
+    )
 
 
-def _best_over_goals(tables: Tables, of_goals: tuple[Task, ...], discount: float) -> float:
-    controllers = subgoal_options(tables, [arrival(tables, goal, discount) for goal in of_goals], discount)
-    solution = option_value_iteration(tables, tabulate_options(controllers, tables.space), discount)
-    return tables.initial_mean(solution.values)
+def _best_over_goals(tables: Tables, paid: Tables, environment: Environment) -> float:
+    """Best value, undiscounted, of choosing among the exact controllers, which hurry; `paid` has the rewards."""
+    subgoals = [arrival(tables, goal, HURRY) for goal in goals(environment)]
+    controllers = tabulate_options(subgoal_options(tables, subgoals, HURRY), tables.space)
+    return paid.initial_mean(option_value_iteration(paid, controllers, 1.0).values)
 
 
-def _chain_panel(followed: dict[str, Followed], optimum: float) -> Panel:
+def _chain_panel(followed: dict[str, Followed]) -> Panel:
+    best = optimum(CHAIN).optimal_return
     x = np.linspace(0, CHAIN_STEPS, 100)
     return Panel(
         "Chain: exact return of the greedy policy",
         "primitive steps",
         "return",
         tuple(Series(name, x, one.at(one.steps, x)) for name, one in followed.items()),
-        references=((f"optimum {optimum:.3f}", optimum),),
+        references=((f"optimum {best:.3f}", best),),
         y_range=(0.0, 0.22),
     )
 
 
-def _tower_panel(towers: dict[str, Tower], best: float) -> Panel:
+def _tower_panel(towers: dict[str, Tower]) -> Panel:
+    best = optimum(ARM).optimal_return
     x = np.linspace(0, ARM_STEPS, 150)
 
     def rows(one: Tower) -> Float[np.ndarray, "N X"]:
