@@ -176,7 +176,10 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
     """The same in a world of numbered states."""
     for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
         if getattr(rules, switch) != wanted:
-            raise InvalidConfig(f"{switch} is {getattr(rules, switch)}, but option-critic learns from single steps.")
+            raise InvalidConfig(
+                f"{switch} is {getattr(rules, switch)}, but option-critic takes each step's reward as it comes and a "
+                "limit for no end."
+            )
     # The fields of `Chance`: options draw their actions and their ends.
     needed = (True, True, world.num_outcomes > 1, len(world.initial_states) > 1)
     everything = jnp.ones(config.num_options, dtype=bool)

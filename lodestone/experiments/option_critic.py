@@ -91,7 +91,7 @@ class Run(NamedTuple):
     """Mean of beta where options arrive, exact, in the end; mean over seeds."""
     gaps: tuple[float, float]
     """Optimal discounted value minus that of the policy as it acts, exact, when the goal moved and in the end; means
-    over seeds."""
+    over seeds. The end is when the slowest seed has finished."""
     seconds: float
 
 
@@ -295,7 +295,7 @@ def _over_training(runs: dict[str, Run]) -> list[Panel]:
     four = runs[FOUR]
     shares = tuple(series(name, four, four.shares[:, :, place]) for place, name in enumerate(places))
     return [
-        Panel("Length of an option, code", "episode", "steps, mean", lengths),
+        Panel("Length of an option, code", "episode", "steps, mean", lengths, y_range=(0.0, 4.0)),
         Panel("Terminations, code", "episode", "beta, mean of cells and options", stops),
         Panel(f"Use of each option, code, {FOUR}", "episode", "share of the steps", shares, y_range=(0.0, 1.0)),
     ]

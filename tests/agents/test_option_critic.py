@@ -312,5 +312,5 @@ def test_bad_settings_are_refused():
         with pytest.raises(InvalidConfig, match=words):
             OptionCriticConfig(**settings)
     for rules in (Rules(undiscounted_option_reward=True), Rules(call_cost=0.5), Rules(bootstrap_at_limit=False)):
-        with pytest.raises(InvalidConfig, match="learns from single steps"):
+        with pytest.raises(InvalidConfig, match="takes each step's reward"):
             option_critic(OptionCriticConfig(), WORLD, rules, 100)
