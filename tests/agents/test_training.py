@@ -139,7 +139,7 @@ def test_a_network_that_does_not_fit_is_no_start():
         train_corridor(replace(CORRIDOR_CONFIG, training="manager"), [0])
     with pytest.raises(InvalidConfig, match="has the options to-2, to-4, but the new one has to-2"):
         train_policy(CORRIDOR_CONFIG, CORRIDOR, primitives, Rules(), 100, [0], tasks=OPTIONS[:1], start=start)
-    with pytest.raises(InvalidConfig, match="another size"):
+    with pytest.raises(InvalidConfig, match="another shape"):
         train_policy(CORRIDOR_CONFIG, longer, primitives, Rules(), 100, [0], tasks=OPTIONS, start=start)
     with pytest.raises(InvalidConfig, match="Only a united network"):
         train_policy(DQNConfig(), CORRIDOR, primitives, Rules(), 100, [0], start=start)
