@@ -24,6 +24,7 @@ from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
 TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
 SMALL = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32", "--learning-starts", "100"]
+GOALS = ["--reward-scale", "0.2", "--discount", "0.97", "--max-goal-steps", "10"]
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
@@ -244,7 +245,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("hamq", ["magnet-arm", *TINY], "20000"),
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
-        ("hdqn", ["magnet-arm", *TINY, *SMALL, "--reward-scale", "0.2", "--discount", "0.97"], "12000"),
+        ("hdqn", ["magnet-arm", *TINY, *SMALL, *GOALS], "20000"),
         ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
         ("sarsa", ["four-rooms", "--dynamics", "deterministic"], "60000"),
     ],

@@ -70,8 +70,9 @@ LAST = 0.2
 ARM = MagnetArm(rows=4, columns=3, bricks=3, tower_height=3)
 ARM_STEPS = 100_000
 HDQN, DQN, DQN_OPTIONS = "h-DQN", "DQN", "DQN, two options"
-STEPS_PER_DECISION = 1.5
-"""Of DQN with options, about: its schedules are in decisions, and its run ends after so many steps as the others."""
+STEPS_PER_DECISION = 1.2
+"""Of DQN with options, rather too few: its schedules are in decisions, and its run ends after as many steps as the
+others."""
 ARM_WORK = 10.0 * CHAIN_STEPS
 """What a learner of the tower takes, about, beside one of the chain."""
 WINDOW = 50
