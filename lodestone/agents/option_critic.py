@@ -46,7 +46,7 @@ class OptionCriticConfig:
     num_options: int = 4
     """How many options there are."""
     temperature: float = 0.01
-    """Of the options' policies."""
+    """Of the options' policies; in proportion to the rewards, and the default is for a goal that is worth 1."""
     critic_rate: Knots = ((0.0, 0.5),)
     """alpha over the run."""
     policy_rate: Knots = ((0.0, 0.25),)

@@ -12,7 +12,7 @@ from lodestone.planning.solve import optimum, value_iteration
 from lodestone.planning.tables import tabulate
 
 SLOWER = "code: steps in the first 50 episodes after the move, 4 options / SARSA"
-"""Measured as 1.3 where less than 1 is required: docs/option-critic.md."""
+"""Measured as 1.25 where less than 1 is required: docs/option-critic.md."""
 
 
 @pytest.mark.parametrize("number", [0, 7])
