@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -22,14 +24,24 @@ LARGE = MagnetArm(4, 3, 3, 3, observation="planes")
 SHAPE = NetworkConfig(kernels=(3,), strides=(1,), channels=(16,), hidden=(32,), pooling=True)
 
 
+@eqx.filter_jit
+def look(task, network, state):
+    return network(task.observe(state))
+
+
+@eqx.filter_jit
+def move(task, state, action):
+    return task.transition(state, action, jnp.int32(0))
+
+
+@eqx.filter_jit
+def over(task, state):
+    return task.terminal(state)
+
+
 def plain_success(policy: UnitedPolicy, network, head: int) -> tuple[float, float]:
     """One layout and one step at a time."""
     task = policy.tasks[head - 1]
-    look, move, over = (
-        jax.jit(lambda state: network(task.observe(state))),
-        jax.jit(task.transition),
-        jax.jit(task.terminal),
-    )
     _, starts = task.initial_distribution()
     done, stopped = [], []
     for position in range(len(starts.row)):
@@ -37,27 +49,33 @@ def plain_success(policy: UnitedPolicy, network, head: int) -> tuple[float, floa
         reached = well = False
         running = True
         for _ in range(policy.option_cap):
-            action = np.int32(np.argmax(look(state).actions[head]))
-            state = move(state, action, np.int32(0))
-            reached |= bool(over(state))
-            if running and look(state).termination[head - 1] > 0.5:
-                running, well = False, bool(over(state))
+            action = np.int32(np.argmax(look(task, network, state).actions[head]))
+            state = move(task, state, action)
+            reached |= bool(over(task, state))
+            if running and look(task, network, state).termination[head - 1] > 0.5:
+                running, well = False, bool(over(task, state))
         done.append(reached)
         stopped.append(well)
     return float(np.mean(done)), float(np.mean(stopped))
 
 
+def at_random(arm: MagnetArm, count: int) -> UnitedPolicy:
+    keys = jax.random.split(jax.random.key(0), count)
+    networks = jax.vmap(lambda key: init_united_network(SHAPE, "hidden", (arm.rows, arm.columns, 4), 6, 2, key))(keys)
+    seeds = tuple(range(count))
+    return UnitedPolicy("united", arm, tasks(arm), 21, Rules(), SHAPE, "hidden", networks, 1.0, seeds)
+
+
 def test_success_is_that_of_a_plain_loop():
-    """By networks that were learned a little, on another grid than theirs."""
-    config = replace(transfer.CONFIG, network=SHAPE, learning_starts=500)
-    policy, _ = transfer._learn("source", SMALL, config, None, 1, Silent())
-    elsewhere = replace(policy, environment=LARGE, tasks=tasks(LARGE))
-    for where in (policy, elsewhere):
-        judged = transfer._judge(policy, where.environment)
-        for head in (1, 2):
-            found = judged.policies[0, head - 1], judged.options[0, head - 1]
-            assert found == pytest.approx(plain_success(where, policy.network(0), head))
-    assert judged.policies.mean() > 0.1
+    """Of networks at random, some of which do a task from some layout by chance; on another grid than theirs, too."""
+    source = at_random(SMALL, 6)
+    for arm in (SMALL, LARGE):
+        judged, where = transfer._judge(source, arm), replace(source, environment=arm, tasks=tasks(arm))
+        assert judged.policies.max() > judged.options.max() > 0
+        for position in range(0, 6, 2):
+            for head in (1, 2):
+                found = judged.policies[position, head - 1], judged.options[position, head - 1]
+                assert found == pytest.approx(plain_success(where, source.network(position), head))
 
 
 @pytest.fixture(autouse=True)
@@ -80,12 +98,9 @@ def test_a_short_run_judges_everywhere_and_learns_in_every_way(monkeypatch):
     assert [len(series.seeds) for series in study.panels[0].series] == [2, 2, 2]
 
 
-def test_networks_at_random_fail_everywhere():
-    keys = jax.random.split(jax.random.key(0), 2)
-    networks = jax.vmap(lambda key: init_united_network(SHAPE, "hidden", (4, 3, 4), 6, 2, key))(keys)
-    policy = UnitedPolicy("united", LARGE, tasks(LARGE), 21, Rules(), SHAPE, "hidden", networks, 1.0, (0, 1))
-    judged = transfer._judge(policy, LARGE)
-    assert judged.options.max() < 0.5
+def test_networks_at_random_fail_in_most_ways():
+    judged = transfer._judge(at_random(LARGE, 2), LARGE)
+    assert judged.options.mean() < 0.5
     assert (judged.terminations > 0.1).all()
     assert not judged.towers.any()
 
