@@ -59,20 +59,19 @@ def plain_success(policy: UnitedPolicy, network, head: int) -> tuple[float, floa
     return float(np.mean(done)), float(np.mean(stopped))
 
 
-def at_random(arm: MagnetArm, count: int) -> UnitedPolicy:
-    keys = jax.random.split(jax.random.key(0), count)
+def at_random(arm: MagnetArm, seeds: tuple[int, ...]) -> UnitedPolicy:
+    keys = jax.random.split(jax.random.key(0), 12)[jnp.asarray(seeds)]
     networks = jax.vmap(lambda key: init_united_network(SHAPE, "hidden", (arm.rows, arm.columns, 4), 6, 2, key))(keys)
-    seeds = tuple(range(count))
     return UnitedPolicy("united", arm, tasks(arm), 21, Rules(), SHAPE, "hidden", networks, 1.0, seeds)
 
 
 def test_success_is_that_of_a_plain_loop():
-    """Of networks at random, some of which do a task from some layout by chance; on another grid than theirs, too."""
-    source = at_random(SMALL, 6)
+    """Of networks at random that do a task from some layouts by chance, as not all do; on another grid, too."""
+    source = at_random(SMALL, (2, 10))
     for arm in (SMALL, LARGE):
         judged, where = transfer._judge(source, arm), replace(source, environment=arm, tasks=tasks(arm))
         assert judged.policies.max() > judged.options.max() > 0
-        for position in range(0, 6, 2):
+        for position in (0, 1):
             for head in (1, 2):
                 found = judged.policies[position, head - 1], judged.options[position, head - 1]
                 assert found == pytest.approx(plain_success(where, source.network(position), head))
@@ -99,7 +98,7 @@ def test_a_short_run_judges_everywhere_and_learns_in_every_way(monkeypatch):
 
 
 def test_networks_at_random_fail_in_most_ways():
-    judged = transfer._judge(at_random(LARGE, 2), LARGE)
+    judged = transfer._judge(at_random(LARGE, (0, 1)), LARGE)
     assert judged.options.mean() < 0.5
     assert (judged.terminations > 0.1).all()
     assert not judged.towers.any()
