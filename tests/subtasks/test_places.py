@@ -53,21 +53,23 @@ def test_residents_and_their_calls(environment, everywhere):
 def test_what_runs_at_random_may_be_running(environment):
     tables, tasks = tabulated(environment)
     random, seen = np.random.default_rng(0), np.zeros_like(tasks.ends)
+    cumulative = tables.probs.cumsum(axis=2)
 
-    def run(subtask, state):
-        while not tasks.ends[subtask, state]:
+    def run(subtask, state, steps_left):
+        """Where it ended, or was cut, and how many steps are left."""
+        while steps_left and not tasks.ends[subtask, state]:
             seen[subtask, state] = True
-            edge = random.choice([edge for edge in tasks.edges_of(subtask) if tasks.available[edge, state]])
-            child = tasks.edges[edge].child
+            edges = [edge for edge in tasks.edges_of(subtask) if tasks.available[edge, state]]
+            child = tasks.edges[edges[random.integers(len(edges))]].child
             if child >= tasks.num_actions:
-                state = run(child - tasks.num_actions, state)
+                state, steps_left = run(child - tasks.num_actions, state, steps_left)
             else:
-                outcome = random.choice(tables.probs.shape[2], p=tables.probs[state, child])
-                state = tables.successors[state, child, outcome]
-        return state
+                outcome = np.searchsorted(cumulative[state, child], random.random(), side="right")
+                state, steps_left = tables.successors[state, child, outcome], steps_left - 1
+        return state, steps_left
 
     for _ in range(200):
-        run(0, random.choice(tables.num_states, p=tables.initial_probs))
+        run(0, random.choice(tables.num_states, p=tables.initial_probs), steps_left=500)
     running = may_be_running(tasks, tables)
     assert (running | ~seen).all()
     assert seen.sum() > running.sum() / 2
