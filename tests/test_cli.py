@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,17 @@ from fake_study import make_study
 from lodestone import __version__
 from lodestone.agents.playing import play_many
 from lodestone.agents.saved import load_policy
+from lodestone.agents.training import AGENTS
 from lodestone.cli import main
+from lodestone.cli.train import Train
+from lodestone.envs.registry import ENVIRONMENTS, environment_class
 from lodestone.errors import UnknownName
 from lodestone.experiments.registry import EXPERIMENTS, experiment
 from lodestone.experiments.study import Experiment, Study
+from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.progress import Progress
 from lodestone.options.base import NO_CAP
+from lodestone.options.execution import Rules
 from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
 TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
@@ -302,7 +308,7 @@ REFUSED = [
     (["train", "hdqn", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "hdqn", "chain", "--success-window", "3"], "success_window must hold"),
     (["train", "united", "magnet-arm", "--option-cap", "5"], "option_cap is given, but no options are"),
-    (["train", "united", "magnet-arm", "--start", "nowhere", "--out", "run"], "nowhere"),
+    (["train", "united", "magnet-arm", "--from-run", "nowhere", "--out", "run"], "nowhere"),
     (["train", "united", "magnet-arm", "--training", "manager", "--out", "run"], "needs a trained network to start"),
     (["train", "dqn", "magnet-arm", "--steps", "0"], "steps is 0"),
     (["train", "dqn", "magnet-arm", "--seeds", "0"], "seeds is 0"),
@@ -333,16 +339,30 @@ def test_a_united_network_starts_as_another_ended_on_another_grid(capsys, tmp_pa
     words = ["train", "united", "magnet-arm", *shape, *short]
     first, second = tmp_path / "first", tmp_path / "second"
     assert run(capsys, *words, "--pooling", *TINY, "--out", str(first))[0] == 0
-    larger = [*words, "--start", str(first), "--training", "manager", "--seeds", "2", "--out", str(second)]
+    larger = [*words, "--from-run", str(first), "--training", "manager", "--seeds", "2", "--out", str(second)]
     code, _, err = run(capsys, *larger)
     assert (code, err.count("\n")) == (2, 1)
     assert "have to be the same" in err
     assert not second.exists()
     assert run(capsys, *larger, "--pooling")[0] == 0
-    assert json.loads((second / "config.json").read_text())["start"] == str(first)
+    assert json.loads((second / "config.json").read_text())["from_run"] == str(first)
     old, new = (load_policy(folder / "policy.safetensors").networks.trunk for folder in (first, second))
     for was, stays in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True):
         np.testing.assert_array_equal(stays, np.repeat(was, 2, axis=0))
+
+
+def flags(settings: type) -> list[str]:
+    """Names of a settings class, those inside others too."""
+    inner = {"network": NetworkConfig, "rules": Rules}
+    names = [field.name for field in dataclasses.fields(settings)]
+    return [one for name in names for one in (flags(inner[name]) if name in inner else [name])]
+
+
+@pytest.mark.parametrize("agent", list(AGENTS))
+@pytest.mark.parametrize("environment", list(ENVIRONMENTS))
+def test_no_two_settings_have_one_name(agent, environment):
+    names = [*flags(Train), *flags(AGENTS[agent]), *flags(environment_class(environment))]
+    assert sorted(set(names)) == sorted(names)
 
 
 def test_an_output_folder_that_cannot_be_written_is_refused(capsys, tmp_path):

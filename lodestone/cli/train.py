@@ -61,7 +61,7 @@ class Train(Generic[AgentT, EnvironmentT]):
     agents that learn within options, which take no caps."""
     primitives: bool = True
     """Whether the agent may choose primitive actions besides the options."""
-    start: Path | None = None
+    from_run: Path | None = None
     """Of a united network: the run, or policy file, of one to start from. One with pooling may be of another grid."""
     out: Path | None = None
     """Folder for config.json, metrics.jsonl and policy.safetensors; without it nothing is saved."""
@@ -83,7 +83,7 @@ def _train(train: Train, agent: str) -> None:
         raise InvalidConfig(f"steps is {train.steps}, but must be at least 1.")
     environment, rules = train.environment, train.rules
     options = _choose_options(train)
-    start = None if train.start is None else _load_start(train.start)
+    start = None if train.from_run is None else _load_start(train.from_run)
     check_training(train.agent, environment, options, rules, start)
     if isinstance(train.agent, MAXQConfig):
         _warn_of_unsafe_abstraction(train.agent, environment, rules.discount)
@@ -95,7 +95,7 @@ def _train(train: Train, agent: str) -> None:
             "environment": describe_environment(environment),
             "rules": dataclasses.asdict(rules),
             "options": list(options.names),
-            "start": None if train.start is None else str(train.start),
+            "from_run": None if train.from_run is None else str(train.from_run),
             "steps": train.steps,
             "seeds": list(seeds),
         }
