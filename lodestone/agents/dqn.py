@@ -27,6 +27,7 @@ from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.replay import Replay, add, empty_replay, sample
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import semi_markov_loss
+from lodestone.learning.updates import run_updates
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Rules
 from lodestone.types import State, Transition
@@ -182,24 +183,15 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
         surplus = jnp.sum(taken.valid) - quota
         learner = learner._replace(replay=add(learner.replay, taken.transition, taken.valid))
 
-        # These two numbers are the same for all seeds, so that under vmap the branch below stays a branch.
-        updates = jnp.where(number >= first_learning_round, config.updates_per_round, 0)
-        updates_before = (number - first_learning_round) * config.updates_per_round
-
         bits = jax.random.bits(update_key, (config.updates_per_round, config.batch_size))
-
-        def learn(index: Int[Array, ""], state: tuple) -> tuple:
-            network, target, adam, total = state
-            current = Learner(network, target, adam, learner.replay)
-            current, value = update(config, environment, current, bits[index], learning_rate)
-            due = (updates_before + index + 1) % config.target_period == 0
-            target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
-            return current.network, target, current.adam, total + value
-
-        state = (learner.network, learner.target, learner.adam, jnp.float32(0))
-        network, target, adam, total = jax.lax.fori_loop(0, updates, learn, state)
-        learner = Learner(network, target, adam, learner.replay)
-        log = log_round(taken, total / jnp.maximum(updates, 1).astype(jnp.float32))
+        learner, mean_loss = run_updates(
+            learner,
+            lambda learner, index: update(config, environment, learner, bits[index], learning_rate),
+            number - first_learning_round,
+            config.updates_per_round,
+            config.target_period,
+        )
+        log = log_round(taken, mean_loss)
         return Carry(learner, actors, surplus, key), log
 
     return Algorithm(init, run_round)

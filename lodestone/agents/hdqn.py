@@ -39,6 +39,7 @@ from lodestone.learning.replay import Replay, add, empty_replay, sample
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import Values, semi_markov_loss
 from lodestone.learning.united_network import Shared
+from lodestone.learning.updates import run_updates
 from lodestone.options.base import NO_CAP
 from lodestone.options.execution import Actor, Decision, Rules
 from lodestone.types import State, Transition
@@ -338,25 +339,15 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
             pursuits=add(learner.pursuits, decisions.transition, decisions.valid),
         )
 
-        # These two numbers are the same for all seeds, so that under vmap the branch below stays a branch.
-        updates = jnp.where(number >= first_learning_round, config.updates_per_round, 0)
-        updates_before = (number - first_learning_round) * config.updates_per_round
         bits = jax.random.bits(update_key, (config.updates_per_round, 2, config.batch_size))
 
-        def learn(count: Int[Array, ""], state: tuple) -> tuple:
-            network, target, adam, total = state
-            current = learner._replace(network=network, target=target, adam=adam)
-            current, value = update(
-                config, environment, goals, rules.discount, current, bits[count], learning_rate, both
-            )
-            due = (updates_before + count + 1) % config.target_period == 0
-            target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
-            return current.network, target, current.adam, total + value
+        def learn(learner: Learner, index: Int[Array, ""]) -> tuple[Learner, Float[Array, ""]]:
+            return update(config, environment, goals, rules.discount, learner, bits[index], learning_rate, both)
 
-        state = (learner.network, learner.target, learner.adam, jnp.float32(0))
-        network, target, adam, total = jax.lax.fori_loop(0, updates, learn, state)
-        learner = learner._replace(network=network, target=target, adam=adam)
-        log = log_round(decisions, total / jnp.maximum(updates, 1).astype(jnp.float32))
+        learner, mean_loss = run_updates(
+            learner, learn, number - first_learning_round, config.updates_per_round, config.target_period
+        )
+        log = log_round(decisions, mean_loss)
         return Carry(learner, actors, remember(carry.outcomes, options, decisions), key), log
 
     return Algorithm(init, run_round)

@@ -54,6 +54,7 @@ from lodestone.learning.united_network import (
     each_head,
     init_united_network,
 )
+from lodestone.learning.updates import run_updates
 from lodestone.options.execution import Decision, Rules
 from lodestone.types import State, Transition
 
@@ -493,28 +494,20 @@ def united(
             piecewise_linear(config.epsilon, fraction),
             piecewise_linear(config.task_epsilon, fraction),
         )
-        learner = carry.learner
-
-        # These numbers are the same for all seeds, so that under vmap the branches below stay branches.
-        updates = jnp.where(number >= learning_starts, config.updates_per_round, 0)
-        updates_before = (number - learning_starts) * config.updates_per_round
-        fresh = jax.lax.cond(number == start, lambda: start_adam(learner.network), lambda: learner.adam)
+        adam = jax.lax.cond(number == start, lambda: start_adam(carry.learner.network), lambda: carry.learner.adam)
         bits = jax.random.bits(update_key, (config.updates_per_round, 2, config.batch_size))
 
-        def learn(count: Int[Array, ""], state: tuple) -> tuple:
-            network, target, adam, total = state
-            current = learner._replace(network=network, target=target, adam=adam)
-            current, value = update(
-                config, stage, environment, options, rules.discount, current, bits[count], learning_rate
-            )
-            due = (updates_before + count + 1) % config.target_period == 0
-            target = jax.lax.cond(due, lambda: current.network, lambda: current.target)
-            return current.network, target, current.adam, total + value
+        def learn(learner: Learner, index: Int[Array, ""]) -> tuple[Learner, Float[Array, ""]]:
+            return update(config, stage, environment, options, rules.discount, learner, bits[index], learning_rate)
 
-        state = (learner.network, learner.target, fresh, jnp.float32(0))
-        network, target, adam, total = jax.lax.fori_loop(0, updates, learn, state)
-        log = log_round(decisions, total / jnp.maximum(updates, 1).astype(jnp.float32))
-        learner = learner._replace(network=network, target=target, adam=adam)
+        learner, mean_loss = run_updates(
+            carry.learner._replace(adam=adam),
+            learn,
+            number - learning_starts,
+            config.updates_per_round,
+            config.target_period,
+        )
+        log = log_round(decisions, mean_loss)
         return carry._replace(learner=learner), log
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
