@@ -50,22 +50,30 @@ class Carry(NamedTuple):
     """Everything that one seed carries from round to round."""
 
     table: Float[Array, "S O"]
-    """Q; starts at zero as in the paper, which is optimistic where steps cost."""
+    """Q; starts at zero as in the paper, which is optimistic where steps cost. Minus infinity where an option may not
+    start, so that no maximum has to look that up."""
     actor: Actor
     key: PRNGKeyArray
 
 
 def update(
-    table: Float[Array, "S O"], decision: Decision, learning_rate: Float[Array, ""]
+    table: Float[Array, "S O"], decision: Decision, learning_rate: Float[Array, ""], may_cut: bool
 ) -> tuple[Float[Array, "S O"], Float[Array, ""]]:
     """One update from one decision between numbered states; none where the decision is not valid. Returns the squared
-    error, too."""
+    error, too.
+
+    `may_cut`: whether a limit may cut an option, which alone is then available in the next state; elsewhere the table
+    says what is available.
+    """
     transition = decision.transition
     next_values = table[transition.next_obs]
-    best = largest(mask_unavailable(next_values, transition.next_available))
-    target = transition.reward + jnp.where(transition.discount > 0, transition.discount * best, 0.0)
-    error = jnp.where(decision.valid, target - table[transition.obs, transition.action], 0.0)
-    return table.at[transition.obs, transition.action].add(learning_rate * error), jnp.square(error)
+    if may_cut:
+        next_values = mask_unavailable(next_values, transition.next_available)
+    target = transition.reward + jnp.where(transition.discount > 0, transition.discount * largest(next_values), 0.0)
+    # One index rather than two: the compiler would first put them together in memory.
+    values, pair = table.ravel(), transition.obs * table.shape[1] + transition.action
+    error = jnp.where(decision.valid, target - values[pair], 0.0)
+    return values.at[pair].add(learning_rate * error).reshape(table.shape), jnp.square(error)
 
 
 def largest(row: Float[Array, " O"]) -> Float[Array, ""]:
@@ -135,7 +143,8 @@ def q_learning_on_numbers(
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        return Carry(jnp.zeros((world.ends.size, options.size)), start_actor(world, actor_key), key)
+        table = jnp.where(options.initiation_table, 0.0, -jnp.inf)
+        return Carry(table, start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`STEPS_PER_ROUND` primitive steps, each with an update if a decision ends on it."""
@@ -146,10 +155,10 @@ def q_learning_on_numbers(
 
         def step(carry: tuple[Array, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Array, Actor], tuple]:
             table, actor = carry
-            available = options.initiation(actor.state)
-            choice = choose(noise[:2], table[actor.state], available, epsilon)
+            values = table[actor.state]
+            choice = choose(noise[:2], values, values > -jnp.inf, epsilon)
             actor, decision = tick(world, options, rules, deal(noise[2:], needed), actor, choice)
-            table, loss = update(table, decision, learning_rate)
+            table, loss = update(table, decision, learning_rate, may_cut=rules.step_limit is not None)
             return (table, actor), (decision, loss)
 
         # Random numbers are drawn for all steps together: one by one they would take longer than the steps.
