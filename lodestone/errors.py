@@ -50,6 +50,10 @@ class CannotDiscover(LodestoneError):
     """A world, or trajectories, without what a method of discovery looks for: no success, no edge, pieces apart."""
 
 
+class EnvironmentFailed(LodestoneError):
+    """An environment that lives outside the program raised an error while an agent acted in it."""
+
+
 class Diverged(LodestoneError):
     """A loss or a parameter stopped being a finite number during training."""
 

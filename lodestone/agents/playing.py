@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
 from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
+from lodestone.envs.base import OutsideEnvironment
+from lodestone.envs.host import visit
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
 from lodestone.learning.united_execution import play_united, trace_united
 from lodestone.options.base import Options
@@ -68,10 +70,11 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
         return play_episode(policy.environment, options, policy.rules, values, key, MAX_STEPS)
 
     @jax.jit
-    def run(learned: PyTree) -> Episode:
-        return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None))(learned, keys)
+    def run(learned: PyTree, keys: PRNGKeyArray) -> Episode:
+        return jax.vmap(jax.vmap(one, in_axes=(None, 0)))(learned, keys)
 
-    return jax.tree.map(np.asarray, run(_learned(policy)))
+    with visit(policy.environment):
+        return jax.tree.map(np.asarray, run(_learned(policy), jnp.stack([keys] * len(policy.seeds))))
 
 
 def _learned(policy: Policy | UnitedPolicy | GoalPolicy | OptionCriticPolicy) -> PyTree:
@@ -88,6 +91,8 @@ def episodes_to_judge(policy: AnyPolicy) -> int:
     """How many episodes tell what a policy is worth: one in a world without chance that begins in one state, if its
     options do not draw their actions."""
     environment = policy.environment
+    if isinstance(environment, OutsideEnvironment):
+        return EPISODES
     alone = environment.num_outcomes == 1 and environment.initial_distribution()[0].shape[0] == 1
     return 1 if alone and not isinstance(policy, OptionCriticPolicy) else EPISODES
 
@@ -122,15 +127,20 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
         options, values = _options(policy, learned), policy.values_of(learned)
         return trace_episode(environment, options, rules, values, key, length)
 
-    trace = jax.tree.map(np.asarray, run(key))
-    states = [jax.tree.map(lambda leaf, step=step: leaf[step], trace.state) for step in range(length)]
-    states.append(jax.tree.map(lambda leaf: leaf[-1], trace.next_state))
+    with visit(policy.environment, film=True) as film:
+        trace = jax.tree.map(np.asarray, run(key))
+    if isinstance(policy.environment, OutsideEnvironment):
+        pictures = film
+    else:
+        states = [jax.tree.map(lambda leaf, step=step: leaf[step], trace.state) for step in range(length)]
+        states.append(jax.tree.map(lambda leaf: leaf[-1], trace.next_state))
+        pictures = [policy.environment.render(state) for state in states]
     return Playback(
         agent=agent,
         seed=policy.seeds[position],
         option_names=policy.options.names if isinstance(policy, Policy) else policy.choices,
         action_names=policy.environment.action_names,
-        pictures=np.stack([policy.environment.render(state) for state in states]),
+        pictures=np.stack(pictures),
         option=trace.option,
         chosen=trace.chosen,
         action=trace.action,

@@ -29,7 +29,7 @@ from lodestone.learning.united_execution import UnitedOptions, choices
 from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
 from lodestone.machines.catalogue import machines
 from lodestone.machines.machine import Hierarchy
-from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.base import Capped, Options, Primitives, Union, primitives
 from lodestone.options.catalogue import goals, scripted_options, task_named, tasks
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
@@ -445,7 +445,7 @@ TABLES = ("initiation_table", "policy_table", "termination_table")
 def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Environment) -> Options:
     match recipe["kind"]:
         case "primitives":
-            return Primitives(environment.action_names)
+            return primitives(environment)
         case "scripted":
             return scripted_options(environment, recipe["names"])
         case "networks":

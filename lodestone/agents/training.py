@@ -21,7 +21,8 @@ from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_lear
 from lodestone.agents.sarsa import SarsaConfig, sarsa
 from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
 from lodestone.agents.united import UnitedConfig, united
-from lodestone.envs.base import Environment, observation_shape
+from lodestone.envs.base import Environment, OutsideEnvironment, observation_shape
+from lodestone.envs.host import visit
 from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig
 from lodestone.learning.history import History
@@ -93,22 +94,23 @@ def train_policy(
     been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True.
-    Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`.
+    Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`, `EnvironmentFailed`.
     """
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
     if isinstance(config, HAMQConfig):
         hierarchy = hierarchy or machines(environment)
     if isinstance(config, UnitedConfig | HDQNConfig):
         tasks = _tasks_for(config, environment, tasks)
-    plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks, start)
-    history = History(len(seeds), plan.choices)
     given = () if start is None else (_in_turn(start, len(seeds)),)
-    for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS), *given):
-        history.add(chunk)
-        steps = min(history.taken(position)[1] for position in range(len(seeds)))
-        fraction = max(chunk.rounds / plan.rounds, steps / length if plan.ends_by_steps else 0.0)
-        if on_chunk(history, min(fraction, 1.0)) or (plan.ends_by_steps and steps >= length):
-            break
+    with visit(environment):
+        plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks, start)
+        history = History(len(seeds), plan.choices)
+        for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS), *given):
+            history.add(chunk)
+            steps = min(history.taken(position)[1] for position in range(len(seeds)))
+            fraction = max(chunk.rounds / plan.rounds, steps / length if plan.ends_by_steps else 0.0)
+            if on_chunk(history, min(fraction, 1.0)) or (plan.ends_by_steps and steps >= length):
+                break
     learned = plan.learned(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(seeds)], plan.of_carry(carry)))
     if isinstance(config, HAMQConfig):
         assert hierarchy is not None
@@ -171,6 +173,8 @@ def _plan(
 ) -> _Plan:
     if start is not None and not isinstance(config, UnitedConfig):
         raise InvalidConfig("Only a united network can start from one that was trained before.")
+    if isinstance(environment, OutsideEnvironment) and (rules.step_limit, rules.decision_limit) != (None, None):
+        raise InvalidConfig("A Gymnasium environment has a limit of its own, max_episode_steps: rules may have none.")
     match config:
         case DQNConfig():
             return _Plan(

@@ -8,8 +8,9 @@ import tyro
 from tyro.conf import OmitArgPrefixes
 
 from lodestone.envs.base import Environment
+from lodestone.envs.host import Registered, is_registered
 from lodestone.envs.registry import ENVIRONMENTS, environment_class
-from lodestone.errors import InvalidConfig, check_name
+from lodestone.errors import InvalidConfig, UnknownName, check_name
 
 
 def take_name(kind: str, known: tuple[str, ...], command: str, words: list[str]) -> tuple[str, list[str]]:
@@ -33,8 +34,16 @@ def take_setting(kind: str, known: tuple[str, ...], command: str, words: list[st
 
 
 def take_environment(command: str, words: list[str]) -> tuple[str, type[Environment], list[str]]:
-    """An environment's name, its class, and the rest. Raises `InvalidConfig` and `UnknownName`."""
-    name, rest = take_name("environment", tuple(ENVIRONMENTS), command, words)
+    """An environment's name, its class, and the rest: a Gymnasium id is a setting of its class.
+
+    Raises `InvalidConfig` and `UnknownName`.
+    """
+    if words and is_registered(words[0]):
+        return words[0], Registered, ["--id", *words]
+    try:
+        name, rest = take_name("environment", tuple(ENVIRONMENTS), command, words)
+    except UnknownName as error:
+        raise UnknownName(f"{str(error).rstrip('.')}, and the ids of Gymnasium, as id or module:id.") from None
     return name, environment_class(name), rest
 
 

@@ -21,12 +21,13 @@ from lodestone.agents.training import AGENTS, AgentConfig, check_training, train
 from lodestone.cli.parsing import parse, settings_of, take_environment, take_name
 from lodestone.cli.printing import print_json
 from lodestone.console import ConsoleProgress
-from lodestone.envs.base import Environment
+from lodestone.envs.base import Environment, OutsideEnvironment
+from lodestone.envs.host import Registered
 from lodestone.envs.registry import describe_environment
 from lodestone.errors import InvalidConfig, InvalidTaskGraph, TooManyStates
 from lodestone.experiments.magnet_tower import OPTION_CAP
 from lodestone.learning.history import History
-from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.base import Capped, Options, Union, primitives
 from lodestone.options.catalogue import named_options
 from lodestone.options.execution import Rules
 from lodestone.options.tabular import TabularOptions
@@ -73,6 +74,8 @@ def run(words: list[str]) -> None:
     """Parse the words after `train` and train."""
     agent, rest = take_name("agent", tuple(AGENTS), "train", words)
     name, environment, rest = take_environment(f"train {agent}", rest)
+    if issubclass(environment, OutsideEnvironment):  # which has a limit of its own
+        rest = ["--decision-limit", "None", *rest]
     _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest), agent)
 
 
@@ -101,7 +104,8 @@ def _train(train: Train, agent: str) -> None:
         }
         folder = RunFolder(train.out, config)
     with ConsoleProgress(1.0) as progress:
-        progress.begin(f"{agent} on {describe_environment(environment)['name']}", 1.0)
+        name = environment.id if isinstance(environment, Registered) else describe_environment(environment)["name"]
+        progress.begin(f"{agent} on {name}", 1.0)
 
         def tell(history: History, fraction: float) -> bool:
             steps = min(history.taken(position)[1] for position in range(len(seeds)))
@@ -148,9 +152,10 @@ def _train(train: Train, agent: str) -> None:
     if train.json:
         print_json(content)
         return
+    ended = "terminated" if isinstance(environment, OutsideEnvironment) else "reached the goal"
     title = f"Greedy policies after training ({history.seconds:.0f} s)"
     table = Table(title=title if judged == 1 else f"{title}, means of {judged} episodes", title_justify="left")
-    for column in ("seed", "steps trained", "return", "optimal return", "steps", "decisions", "reached the goal"):
+    for column in ("seed", "steps trained", "return", "optimal return", "steps", "decisions", ended):
         table.add_column(column, justify="right")
     for row in content["seeds"]:
         table.add_row(
@@ -179,7 +184,7 @@ def _choose_options(train: Train) -> Options:
     environment = train.environment
     if train.option_cap is not None and not train.options:
         raise InvalidConfig("option_cap is given, but no options are.")
-    parts: list[Options] = [Primitives(environment.action_names)] if train.primitives else []
+    parts: list[Options] = [primitives(environment)] if train.primitives else []
     if train.options:
         first = Path(train.options[0])
         is_file = len(train.options) == 1 and (first.suffix or first.exists())

@@ -68,6 +68,43 @@ class Environment(eqx.Module):
         return len(self.action_names)
 
 
+class OutsideEnvironment(Environment):
+    """An environment that is no pure function but something outside the program, which a step asks: its states cannot
+    be made, nor listed, and a step that was taken cannot be taken back."""
+
+    @abstractmethod
+    def example(self) -> State:
+        """Any state, for shapes and dtypes."""
+
+    @abstractmethod
+    def begin(self, uniform: Float[Array, ""]) -> State:
+        """The first state of a new copy's first episode."""
+
+    @abstractmethod
+    def begin_again(self, ended: State) -> State:
+        """The first state of the episode after the one that ended in this state."""
+
+    @abstractmethod
+    def allowed(self, state: State) -> Bool[Array, " A"]:
+        """The actions that may be taken."""
+
+    @abstractmethod
+    def truncated(self, state: State) -> Bool[Array, ""]:
+        """Whether a limit of its own, no end, cut the episode here."""
+
+    @abstractmethod
+    def hold(self, state: State, still: Bool[Array, ""]) -> State:
+        """The state from which no step is taken where `still`: what comes of it then will not be used."""
+
+    @abstractmethod
+    def remember(self, state: State) -> State:
+        """What a memory needs of the state: enough to observe it."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go of all copies: states from before are void."""
+
+
 class Step(NamedTuple):
     """What one primitive step brought."""
 
@@ -102,6 +139,8 @@ def sample_categorical(key: PRNGKeyArray, probs: Float[Array, " K"]) -> Int[Arra
 
 def initial_state(environment: Environment, uniform: Float[Array, ""]) -> State:
     """The first state of an episode that a uniform number in [0, 1) picks."""
+    if isinstance(environment, OutsideEnvironment):
+        return environment.begin(uniform)
     with jax.ensure_compile_time_eval():
         probs, states = environment.initial_distribution()
     count = probs.shape[0]
@@ -114,6 +153,13 @@ def initial_state(environment: Environment, uniform: Float[Array, ""]) -> State:
         edges = jnp.cumsum(probs)
         index = jnp.searchsorted(edges, uniform * edges[-1], side="right", method="scan_unrolled")
     return jax.tree.map(lambda leaf: leaf[index], states)
+
+
+def next_episode(environment: Environment, uniform: Float[Array, ""], ended: State) -> State:
+    """The first state of the episode that follows one that ended in a state."""
+    if isinstance(environment, OutsideEnvironment):
+        return environment.begin_again(ended)
+    return initial_state(environment, uniform)
 
 
 def next_step(environment: Environment, uniform: Float[Array, ""], state: State, action: Int[Array, ""]) -> Step:
@@ -135,8 +181,15 @@ def sample_step(environment: Environment, key: PRNGKeyArray, state: State, actio
     return next_step(environment, jax.random.uniform(key), state, action)
 
 
+def remembered(environment: Environment, state: State) -> State:
+    """What a memory keeps of a state."""
+    return environment.remember(state) if isinstance(environment, OutsideEnvironment) else state
+
+
 def example_state(environment: Environment) -> State:
     """The first of the initial states: an example for shapes and dtypes."""
+    if isinstance(environment, OutsideEnvironment):
+        return environment.example()
     _, states = environment.initial_distribution()
     return jax.tree.map(lambda leaf: leaf[0], states)
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from typing import Any
 
 from lodestone.envs.base import Environment
 from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
+from lodestone.envs.host import Registered
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
-from lodestone.errors import UnknownName, check_name
+from lodestone.errors import InvalidConfig, UnknownName, check_name
 
 ENVIRONMENTS: dict[str, type[Environment]] = {
     "magnet-arm": MagnetArm,
@@ -25,6 +27,12 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
     "random-mdp": RandomMDP,
 }
 """Every environment, by name."""
+
+GYMNASIUM = "gymnasium"
+"""The name of all those that Gymnasium makes by an id."""
+
+PLUGINS = ("minigrid", "ale_py")
+"""Modules that an id may name without being imported before: a file's id must not run a stranger's code."""
 
 
 def environment_class(name: str) -> type[Environment]:
@@ -38,16 +46,20 @@ def make_environment(name: str, **parameters: Any) -> Environment:
 
     Raises `UnknownName` for a name or a parameter that does not exist, and `InvalidConfig` for a bad value.
     """
-    environment = environment_class(name)
+    environment = Registered if name == GYMNASIUM else environment_class(name)
     known = tuple(field.name for field in dataclasses.fields(environment))
     for parameter in parameters:
         check_name(f"parameter of {name}", parameter, known)
+    if name == GYMNASIUM:
+        module, colon, _ = str(parameters.get("id")).rpartition(":")
+        if colon and module not in (*PLUGINS, *sys.modules):
+            raise InvalidConfig(f"The environment is of the module {module}, which has to be imported before.")
     return environment(**parameters)
 
 
 def describe_environment(environment: Environment) -> dict[str, Any]:
     """Name and parameters, fit for JSON and for `make_environment`."""
-    for name, kind in ENVIRONMENTS.items():
+    for name, kind in {**ENVIRONMENTS, GYMNASIUM: Registered}.items():
         if type(environment) is kind:
             fields = dataclasses.fields(environment)
             return {"name": name, "parameters": {field.name: getattr(environment, field.name) for field in fields}}

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, example_state
+from lodestone.envs.base import Environment, OutsideEnvironment, example_state, remembered
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Decision, Rules, draw_chance, start_actor, tick
 from lodestone.types import State, Transition
@@ -56,6 +56,9 @@ def collect(
     def step(carry: tuple) -> tuple:
         actors, waiting, count, ticks = carry
         tick_key = jax.random.fold_in(key, ticks)
+        if isinstance(environment, OutsideEnvironment):  # where seeds are vmapped, this runs until the last is done
+            held = jax.vmap(environment.hold, in_axes=(0, None))(actors.state, ~unfinished(carry))
+            actors = actors._replace(state=held)
         actors, decisions = tick_all(environment, options, rules, tick_key, actors, choose)
         rank = jnp.cumsum(decisions.valid.astype(jnp.int32)) + count
         slot = jnp.where(decisions.valid, rank - 1, capacity)  # out of range: dropped
@@ -70,7 +73,7 @@ def collect(
 
 def no_decisions(environment: Environment, options: Options, capacity: int) -> Decision:
     """[capacity] decisions, none of them valid."""
-    state = example_state(environment)
+    state = remembered(environment, example_state(environment))
     zero, real = jnp.int32(0), jnp.float32(0)
     available = jnp.zeros(options.size, dtype=bool)
     example = Decision(

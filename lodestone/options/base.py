@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from lodestone.envs.base import Environment, OutsideEnvironment
 from lodestone.errors import InvalidConfig
 from lodestone.types import State
 
@@ -82,6 +83,22 @@ class Primitives(Options):
     def termination(self, state: State) -> Float[Array, " O"]:
         del state
         return jnp.ones(self.size, dtype=jnp.float32)
+
+
+class AllowedPrimitives(Primitives):
+    """The primitive actions of an environment that does not allow all of them everywhere."""
+
+    environment: OutsideEnvironment
+
+    def initiation(self, state: State) -> Bool[Array, " O"]:
+        return self.environment.allowed(state)
+
+
+def primitives(environment: Environment) -> Primitives:
+    """The primitive actions of an environment as options."""
+    if isinstance(environment, OutsideEnvironment):
+        return AllowedPrimitives(environment.action_names, environment)
+    return Primitives(environment.action_names)
 
 
 class Union(Options):

@@ -15,7 +15,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, initial_state, inverse_cdf, next_step, sample_initial
+from lodestone.envs.base import (
+    Environment,
+    OutsideEnvironment,
+    inverse_cdf,
+    next_episode,
+    next_step,
+    remembered,
+    sample_initial,
+)
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import Options
 from lodestone.planning.enumerated import Enumerated, look_up_step
@@ -96,7 +104,7 @@ def start_actor(environment: Environment, key: PRNGKeyArray) -> Actor:
     return Actor(
         state=state,
         deciding=jnp.bool_(True),
-        start=state,
+        start=remembered(environment, state),
         option=jnp.int32(0),
         elapsed=jnp.int32(0),
         reward=jnp.float32(0),
@@ -166,7 +174,7 @@ def tick(
     """
     fresh = actor.deciding
     option = jnp.where(fresh, choice, actor.option)
-    start = _select(fresh, actor.state, actor.start)
+    start = _select(fresh, remembered(environment, actor.state), actor.start)
     reward_before = jnp.where(fresh, 0.0, actor.reward)
     discount_before = jnp.where(fresh, 1.0, actor.discount)
 
@@ -188,6 +196,8 @@ def tick(
     beta = options.termination(state)[option]
     stops = (chance.termination < beta) | (elapsed >= caps[option])
     truncated = jnp.bool_(False)
+    if isinstance(environment, OutsideEnvironment):
+        truncated = environment.truncated(state)
     if rules.step_limit is not None:
         truncated |= episode_steps >= rules.step_limit
     if rules.decision_limit is not None:
@@ -197,7 +207,7 @@ def tick(
 
     # Cut by a limit before its own end: the option would have gone on, so only its own value may be bootstrapped from.
     available = options.initiation(state)
-    if rules.step_limit is not None:
+    if rules.step_limit is not None or isinstance(environment, OutsideEnvironment):
         cut = truncated & ~stops
         available = jnp.where(cut, jnp.arange(options.size) == option, available)
     no_future = terminated if rules.bootstrap_at_limit else terminated | truncated
@@ -210,7 +220,7 @@ def tick(
             action=option,
             reward=option_reward,
             discount=jnp.where(no_future, 0.0, discount),
-            next_obs=state,
+            next_obs=remembered(environment, state),
             next_available=available,
         ),
         steps=elapsed,
@@ -223,7 +233,7 @@ def tick(
 
     over = terminated | truncated
     next_actor = Actor(
-        state=_select(over, initial_state(environment, chance.restart), state),
+        state=_select(over, next_episode(environment, chance.restart, state), state),
         deciding=ended,
         start=start,
         option=option,
