@@ -10,7 +10,7 @@ reproduce: .venv/installed
 	$(BIN)/lodestone reproduce
 
 test: .venv/installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 lint: .venv/installed
 	$(BIN)/ruff check .
@@ -18,7 +18,7 @@ lint: .venv/installed
 	$(BIN)/mypy
 
 gates: .venv/installed
-	$(BIN)/python -m pytest -m "slow or not slow"
+	$(BIN)/python -m pytest -n 2 -m "slow or not slow"
 
 benchmarks: .venv/installed
 	$(BIN)/python -m pip install -c constraints.txt -e '.[benchmarks]'

@@ -32,7 +32,9 @@ from lodestone.envs.base import Environment
 from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
+from lodestone.envs.host import FromFunction, Registered
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
+from lodestone.envs.option_env import HostOption, OptionEnv
 from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.task import Task, goal
 from lodestone.envs.taxi import Taxi
@@ -40,7 +42,7 @@ from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
 from lodestone.learning.networks import NetworkConfig
 from lodestone.machines.machine import Hierarchy, Machine, every_action
-from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.base import Capped, Options, Primitives, Union, primitives
 from lodestone.options.catalogue import named_options, scripted_options
 from lodestone.options.execution import Rules
 from lodestone.options.four_rooms import hallway_options
@@ -63,10 +65,12 @@ __all__ = [
     "EigenoptionsConfig",
     "Environment",
     "FourRooms",
+    "FromFunction",
     "GoalPolicy",
     "HAMQConfig",
     "HDQNConfig",
     "Hierarchy",
+    "HostOption",
     "Interrupting",
     "IntraOptionConfig",
     "LodestoneError",
@@ -77,6 +81,7 @@ __all__ = [
     "NetworkConfig",
     "OptionCriticConfig",
     "OptionCriticPolicy",
+    "OptionEnv",
     "Options",
     "Playback",
     "Policy",
@@ -84,6 +89,7 @@ __all__ = [
     "QLearningConfig",
     "RandomMDP",
     "Recording",
+    "Registered",
     "Rules",
     "SarsaConfig",
     "Script",
@@ -109,6 +115,7 @@ __all__ = [
     "optimum",
     "play",
     "pretrain",
+    "primitives",
     "record",
     "save_options",
     "save_policy",
