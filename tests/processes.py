@@ -52,8 +52,9 @@ class Program:
             while process.is_alive() and count_lines(run) < lines:
                 time.sleep(0.001)
             time.sleep(delay)
-            assert process.pid is not None
-            os.kill(process.pid, end)  # it is not reaped before it is joined
+            if process.is_alive():
+                assert process.pid is not None
+                os.kill(process.pid, end)
         return process.exitcode, self.printed
 
     @property
