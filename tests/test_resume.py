@@ -148,6 +148,14 @@ def test_a_run_survives_every_end(program, whole, unfinished, tmp_path):
     assert_same(run, whole("tabular"))
 
 
+def test_metrics_that_cannot_be_written_are_said(program, tmp_path):
+    run = tmp_path / "run"
+    code, printed = program.run(*train("tabular", run, every="60"), prepare=partial(fill_disk, 4000))
+    assert code == 2
+    assert printed.splitlines()[-1] == f"lodestone: Cannot write {run}/metrics.jsonl: File too large."
+    assert "Traceback" not in printed
+
+
 def _chunks(checkpoint: Path) -> int:
     return len(read_arrays(checkpoint)[0]["history/usage/seconds"])
 

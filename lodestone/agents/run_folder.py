@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self, TextIO
 
@@ -43,7 +44,8 @@ class RunFolder:
 
     def __exit__(self, *exception: object) -> None:
         if self._metrics is not None:
-            self._metrics.close()
+            with suppress(OSError):  # of lines that could not be written, which was said
+                self._metrics.close()
         self._lock.close()
 
     def begin(self, run: Run) -> None:

@@ -110,7 +110,8 @@ def train(
     over_seeds, everywhere = PartitionSpec("seeds"), PartitionSpec()
 
     def place(tree: PyTree) -> PyTree:
-        return jax.device_put(jax.tree.map(lambda leaf: leaf[positions], tree), NamedSharding(mesh, over_seeds))
+        repeated = jax.jit(partial(jax.tree.map, lambda leaf: leaf[positions]))(tree)
+        return jax.device_put(repeated, NamedSharding(mesh, over_seeds))
 
     spread = partial(jax.shard_map, mesh=mesh, check_vma=False)
     init = jax.jit(spread(jax.vmap(algorithm.init), in_specs=over_seeds, out_specs=over_seeds))
