@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+import signal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -231,4 +232,30 @@ def test_what_cannot_be_written_is_said_after_the_next_chunk(tmp_path, monkeypat
 
 def test_one_is_written_when_it_is_due(tmp_path):
     save(tmp_path, 2, 4, every=60.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_waits_for_a_last_one_and_a_second_does_not(tmp_path):
+    with Checkpoints(tmp_path, "run", every=60.0) as checkpoints:
+        checkpoints.after_chunk(make_carry(), make_history(), 2)
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            checkpoints.after_chunk(make_carry(), make_history(), 4)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert [path.stem for path in tmp_path.iterdir()] == ["000000000004"]
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_that_is_ignored_stays_ignored(tmp_path):
+    """As of a process in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Checkpoints(tmp_path, "run", every=60.0) as checkpoints:
+            signal.raise_signal(signal.SIGINT)
+            checkpoints.after_chunk(make_carry(), make_history(), 2)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert list(tmp_path.iterdir()) == []
