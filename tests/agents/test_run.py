@@ -23,6 +23,7 @@ from lodestone.agents.training import AGENTS, train_policy
 from lodestone.agents.united import UnitedConfig
 from lodestone.envs.chain import Chain
 from lodestone.envs.four_rooms import FourRooms
+from lodestone.envs.host import Registered
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import InvalidConfig
@@ -31,7 +32,7 @@ from lodestone.learning.checkpoints import Checkpoints
 from lodestone.learning.history import History
 from lodestone.learning.networks import NetworkConfig, init_q_network
 from lodestone.learning.united_network import init_united_network
-from lodestone.options.base import Capped, Options, Primitives, Union
+from lodestone.options.base import Capped, Options, Primitives, Union, primitives
 from lodestone.options.catalogue import named_options, tasks
 from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
@@ -128,6 +129,16 @@ def test_what_a_network_starts_as_comes_back(tmp_path):
     found = read_run(tmp_path)
     assert found.from_run == "there/run"
     jax.tree.map(np.testing.assert_array_equal, found.start.networks, made)
+
+
+def test_a_gymnasium_environment_comes_back_and_has_no_checkpoints(tmp_path):
+    world = Registered("CartPole-v1", max_episode_steps=30)
+    run = Run(DQNConfig(network=FLAT), world, Rules(), primitives(world), 100, (0,))
+    save_run(tmp_path, run)
+    assert read_run(tmp_path) == run
+    with pytest.raises(InvalidConfig, match="keeps its state to itself"):
+        train(run, Checkpoints(tmp_path, "run"))
+    world.close()
 
 
 @pytest.mark.parametrize(
