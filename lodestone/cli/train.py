@@ -79,10 +79,10 @@ def run(words: list[str]) -> None:
     name, environment, rest = take_environment(f"train {agent}", rest)
     if issubclass(environment, OutsideEnvironment):  # which has a limit of its own
         rest = ["--decision-limit", "None", *rest]
-    _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest), agent)
+    _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest))
 
 
-def _train(train: Train, agent: str) -> None:
+def _train(train: Train) -> None:
     if train.seeds < 1:
         raise InvalidConfig(f"seeds is {train.seeds}, but must be at least 1.")
     environment, rules = train.environment, train.rules
