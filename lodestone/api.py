@@ -40,6 +40,7 @@ from lodestone.envs.task import Task, goal
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
+from lodestone.learning.checkpoints import Checkpoints
 from lodestone.learning.networks import NetworkConfig
 from lodestone.machines.machine import Hierarchy, Machine, every_action
 from lodestone.options.base import Capped, Options, Primitives, Union, primitives
@@ -57,6 +58,7 @@ __all__ = [
     "BetweennessConfig",
     "Capped",
     "Chain",
+    "Checkpoints",
     "Child",
     "CorridorMaze",
     "CoveringConfig",

@@ -23,6 +23,8 @@ class ConsoleProgress:
         self._stage_done = 0.0
         self._skipped = 0.0
         """Work of stages that ended before their time; it says nothing about the speed."""
+        self._elsewhere = 0.0
+        """The same of the stage's work that another process did before."""
         self._stage = ""
         self._started = monotonic()
         self._last_line = -SECONDS_BETWEEN_LINES
@@ -49,9 +51,13 @@ class ConsoleProgress:
     def begin(self, stage: str, work: float) -> None:
         """A stage begins, with so much work ahead."""
         self._done_before += self._stage_work
-        self._skipped += self._stage_work - self._stage_done
-        self._stage, self._stage_work = stage, work
+        self._skipped += self._stage_work - self._stage_done + self._elsewhere
+        self._stage, self._stage_work, self._elsewhere = stage, work, 0.0
         self.advance(0.0, "compiling")
+
+    def skip(self, work: float) -> None:
+        """So much of the stage's work had been done before it began here."""
+        self._elsewhere = work
 
     def advance(self, work: float, text: str) -> None:
         """So much of the stage's work has been done in all."""
@@ -67,7 +73,7 @@ class ConsoleProgress:
             )
 
     def _time_left(self, done: float) -> str:
-        worked = done - self._skipped
+        worked = done - self._skipped - self._elsewhere
         if worked < 0.02 * self._total:
             return "estimating"
         seconds = (monotonic() - self._started) * (self._total - done) / worked

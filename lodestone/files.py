@@ -11,7 +11,7 @@ import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -32,6 +32,28 @@ def prepare_folder(path: Path) -> Path:
     except OSError as error:
         raise CannotWrite(f"The output folder {path} cannot be written: {error.strerror or error}.") from None
     return path
+
+
+def lock(path: Path) -> BinaryIO:
+    """Hold `path`, an empty file, until what is returned is closed or this process ends, however it ends.
+
+    Raises `CannotWrite` while another process holds it. Where files cannot be locked (Windows, some network file
+    systems) it holds nothing.
+    """
+    try:
+        file = path.open("ab")
+    except OSError as error:
+        raise CannotWrite(f"The output folder {path.parent} cannot be written: {error.strerror or error}.") from None
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise CannotWrite(f"Another process is writing in {path.parent}.") from None
+    except (ImportError, OSError):
+        pass
+    return file
 
 
 def write_atomically(path: str | Path, content: bytes) -> None:
@@ -86,7 +108,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except OSError as error:
         raise BadFile(f"{path} cannot be read: {error.strerror or error}.") from None
-    except ValueError:
+    except (ValueError, RecursionError):
         raise BadFile(f"{path} is no JSON file.") from None
 
 
@@ -110,7 +132,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise BadFile(f"{path} was not saved by Lodestone.")
     try:
         content = json.loads(header)
-    except ValueError:
+    except (ValueError, RecursionError):
         content = None
     if not isinstance(content, dict):
         raise BadFile(f"{path} was not saved by Lodestone.")

@@ -99,7 +99,9 @@ def test_train_leaves_a_run_folder(trained):
     last = lines[-1]
     assert last["steps"] >= 900
     assert sum(last["calls"].values()) > 0
-    assert sorted(path.name for path in trained.iterdir()) == ["config.json", "metrics.jsonl", "policy.safetensors"]
+    assert config["versions"]["jax"] == jax.__version__
+    files = [".lock", "config.json", "metrics.jsonl", "options.safetensors", "policy.safetensors"]
+    assert sorted(path.name for path in trained.iterdir()) == files
 
 
 def test_watch_plays_in_a_pipe_and_writes_pictures(trained, capsys, tmp_path):

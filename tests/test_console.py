@@ -29,3 +29,15 @@ def test_the_estimate_comes_from_work_that_was_done(clock, capsys):
         "5% first about 3:10 left half a job",
         "50% second about 1:40 left compiling",
     ]
+
+
+def test_work_of_another_process_says_nothing_about_the_speed(clock, capsys):
+    with ConsoleProgress(200.0) as progress:
+        progress.begin("first", 100.0)
+        clock.now += 10
+        progress.skip(60.0)
+        progress.advance(70.0, "on it")
+        progress.begin("second", 100.0)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "about 2:10 left" in lines[1]  # 130 units, of which 10 took 10 seconds
+    assert "about 1:40 left" in lines[2]

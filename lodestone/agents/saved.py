@@ -24,6 +24,7 @@ from lodestone.envs.task import Task
 from lodestone.errors import BadFile, InvalidConfig, LodestoneError, check_name
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.goal_network import GoalNetwork, GoalOptions, init_goal_network
+from lodestone.learning.named_arrays import Arrays, fill, named_arrays
 from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
 from lodestone.learning.united_execution import UnitedOptions, choices
 from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
@@ -39,7 +40,6 @@ from lodestone.options.tabular import TabularOptions
 from lodestone.planning.joint import JointProcess, joint_process
 from lodestone.types import State
 
-Arrays = dict[str, np.ndarray]
 Recipe = dict[str, Any]
 T = TypeVar("T")
 
@@ -227,7 +227,7 @@ def save_policy(path: Path, policy: AnyPolicy) -> None:
         "reward_scale": policy.reward_scale,
         "seeds": list(policy.seeds),
     }
-    write_arrays(path, arrays | _named_arrays(policy.learned, "learned"), header)
+    write_arrays(path, arrays | named_arrays(policy.learned, "learned"), header)
 
 
 def _save_machine_policy(path: Path, policy: MachinePolicy) -> None:
@@ -279,7 +279,7 @@ def _save_heads(path: Path, policy: UnitedPolicy | GoalPolicy) -> None:
         "reward_scale": policy.reward_scale,
         "seeds": list(policy.seeds),
     }
-    write_arrays(path, _named_arrays(policy.networks, "learned"), header)
+    write_arrays(path, named_arrays(policy.networks, "learned"), header)
 
 
 def _save_option_critic_policy(path: Path, policy: OptionCriticPolicy) -> None:
@@ -292,7 +292,7 @@ def _save_option_critic_policy(path: Path, policy: OptionCriticPolicy) -> None:
         "rules": asdict(policy.rules),
         "seeds": list(policy.seeds),
     }
-    write_arrays(path, _named_arrays(policy.learned, "learned"), header)
+    write_arrays(path, named_arrays(policy.learned, "learned"), header)
 
 
 def load_policy(path: Path) -> AnyPolicy:
@@ -315,11 +315,11 @@ def load_policy(path: Path) -> AnyPolicy:
             template: PyTree = jax.ShapeDtypeStruct(shape, jnp.float32)
         else:
             template = _network_template(header["network"], environment, options.size, len(seeds))
-        learned = _fill(template, arrays, "learned")
+        learned = fill(template, arrays, "learned")
         rules = Rules(**header["rules"])
         return Policy(header["agent"], environment, options, rules, learned, float(header["reward_scale"]), seeds)
 
-    return _refuse_bad(path, build)
+    return refuse_bad(path, build)
 
 
 def _build_machine_policy(environment: Environment, header: Recipe, arrays: Arrays) -> MachinePolicy:
@@ -327,7 +327,7 @@ def _build_machine_policy(environment: Environment, header: Recipe, arrays: Arra
     hierarchy = machines(environment)
     process = joint_process(environment, hierarchy)
     template = {"tables": jax.ShapeDtypeStruct((len(seeds), *process.edges.shape), jnp.float32)}
-    tables = np.asarray(_fill(template, {"['tables']": arrays["tables"]}, "")["tables"])
+    tables = np.asarray(fill(template, {"['tables']": arrays["tables"]}, "")["tables"])
     if not np.array_equal(np.isneginf(tables), np.broadcast_to(~process.available, tables.shape)):
         raise BadFile("its values are of other machines.")
     return MachinePolicy(str(header["agent"]), environment, hierarchy, Rules(**header["rules"]), tables, seeds)
@@ -355,7 +355,7 @@ def _build_heads(
         rules=Rules(**header["rules"]),
         shape=shape,
         shared=shared,
-        networks=_fill(template, arrays, "learned"),
+        networks=fill(template, arrays, "learned"),
         reward_scale=float(header["reward_scale"]),
         seeds=seeds,
     )
@@ -370,7 +370,7 @@ def _build_option_critic_policy(environment: Environment, header: Recipe, arrays
         environment=environment,
         rules=Rules(**header["rules"]),
         temperature=config.temperature,
-        learned=_fill(template, arrays, "learned"),
+        learned=fill(template, arrays, "learned"),
         seeds=seeds,
     )
 
@@ -390,7 +390,7 @@ def save_options(path: Path, options: Options, environment: Environment) -> None
 def load_options(path: Path, environment: Environment) -> Options:
     """Options for `environment`. Raises `BadFile`, also where they were made for observations of another shape."""
     arrays, header = _read(path, "options")
-    return _refuse_bad(path, lambda: _build_options(header["options"], arrays, "options", environment))
+    return refuse_bad(path, lambda: _build_options(header["options"], arrays, "options", environment))
 
 
 def _read(path: Path, kind: str) -> tuple[Arrays, Recipe]:
@@ -400,7 +400,7 @@ def _read(path: Path, kind: str) -> tuple[Arrays, Recipe]:
     return arrays, header
 
 
-def _refuse_bad(path: Path, build: Callable[[], T]) -> T:
+def refuse_bad(path: Path, build: Callable[[], T]) -> T:
     """`build()`, with whatever is wrong with a recipe turned into one sentence."""
     try:
         return build()
@@ -408,7 +408,7 @@ def _refuse_bad(path: Path, build: Callable[[], T]) -> T:
         raise BadFile(f"{path}: {error}") from None
     except LodestoneError as error:
         raise BadFile(f"{path} does not fit: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError):
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, RecursionError):
         raise BadFile(f"{path} is damaged, or from another version than {__version__}.") from None
 
 
@@ -424,9 +424,9 @@ def _describe_options(options: Options, prefix: str) -> tuple[Recipe, Arrays]:
                 "kind": "networks",
                 "names": list(options.names),
                 "network": network,
-            }, _named_arrays(options.networks, prefix)
+            }, named_arrays(options.networks, prefix)
         case TabularOptions():
-            tables = _named_arrays({name: getattr(options, name) for name in TABLES}, prefix)
+            tables = named_arrays({name: getattr(options, name) for name in TABLES}, prefix)
             return {"kind": "tabular", "names": list(options.names), "caps": list(options.caps)}, tables
         case Capped():
             recipe, arrays = _describe_options(options.options, prefix)
@@ -451,7 +451,7 @@ def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Env
         case "networks":
             tasks = tuple(task_named(environment, name) for name in recipe["names"])
             template = _network_template(recipe["network"], environment, environment.num_actions, len(tasks))
-            return NetworkOptions(tasks, _fill(template, arrays, prefix))
+            return NetworkOptions(tasks, fill(template, arrays, prefix))
         case "tabular":
             space = reachable_states(environment)
             names, caps = tuple(recipe["names"]), tuple(recipe["caps"])
@@ -461,7 +461,7 @@ def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Env
                 "policy_table": jax.ShapeDtypeStruct((*shape, environment.num_actions), jnp.float32),
                 "termination_table": jax.ShapeDtypeStruct(shape, jnp.float32),
             }
-            return TabularOptions(space, names, caps, **_fill(tables, arrays, prefix))
+            return TabularOptions(space, names, caps, **fill(tables, arrays, prefix))
         case "capped":
             return Capped(_build_options(recipe["options"], arrays, prefix, environment), int(recipe["cap"]))
         case "union":
@@ -497,27 +497,3 @@ def _network_template(recipe: Recipe, environment: Environment, outputs: int, co
     config, seen = _build_shape(recipe), observation_shape(environment)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), count))
     return jax.eval_shape(jax.vmap(lambda key: init_q_network(config, seen, outputs, key)), keys)
-
-
-def _named_arrays(tree: PyTree, prefix: str) -> Arrays:
-    """The arrays of a pytree by their paths."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {prefix + jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
-
-
-def _fill(template: PyTree, arrays: Arrays, prefix: str) -> PyTree:
-    """A pytree of the template's structure from named arrays. Raises `BadFile` where a shape or a type differs."""
-
-    def find(path: tuple, wanted: jax.ShapeDtypeStruct) -> Array:
-        name = prefix + jax.tree_util.keystr(path)
-        if name not in arrays:
-            raise BadFile(f"the array {name} is missing")
-        found = arrays[name]
-        if found.shape != wanted.shape or found.dtype != wanted.dtype:
-            raise BadFile(
-                f"{name} is {found.dtype} {list(found.shape)}, but this environment needs "
-                f"{wanted.dtype} {list(wanted.shape)}."
-            )
-        return jnp.asarray(found)
-
-    return jax.tree_util.tree_map_with_path(find, template)

@@ -25,8 +25,9 @@ from lodestone.envs.base import Environment, OutsideEnvironment, observation_sha
 from lodestone.envs.host import visit
 from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig
+from lodestone.learning.checkpoints import Checkpoints
 from lodestone.learning.history import History
-from lodestone.learning.loop import Algorithm, train
+from lodestone.learning.loop import Algorithm, carried, train
 from lodestone.learning.united_execution import choices
 from lodestone.learning.united_network import UnitedNetwork
 from lodestone.machines.catalogue import machines
@@ -84,6 +85,7 @@ def train_policy(
     graph: TaskGraph | None = None,
     tasks: Sequence[Task] | None = None,
     start: UnitedPolicy | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> tuple[AnyPolicy, History]:
     """Train all seeds at once for `length` decisions each (tabular agents, united networks and h-DQN: primitive steps).
 
@@ -93,24 +95,40 @@ def train_policy(
     step. A united network starts as that of `start`, the first seed as its first one and so on, in turn; it may have
     been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
-    True.
-    Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`, `EnvironmentFailed`.
+    True. With `checkpoints` the run goes on from the newest one, and writes more; the other arguments must be the same
+    as before.
+    Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`, `EnvironmentFailed`; with `checkpoints`
+    `BadFile` and `CannotWrite`, too.
     """
     name = next(name for name, kind in AGENTS.items() if isinstance(config, kind))
     if isinstance(config, HAMQConfig):
         hierarchy = hierarchy or machines(environment)
     if isinstance(config, UnitedConfig | HDQNConfig):
         tasks = _tasks_for(config, environment, tasks)
+    if checkpoints is not None and isinstance(environment, OutsideEnvironment):
+        raise InvalidConfig("A Gymnasium environment keeps its state to itself, so there can be no checkpoints.")
     given = () if start is None else (_in_turn(start, len(seeds)),)
     with visit(environment):
         plan = _plan(config, environment, options, rules, length, hierarchy, graph, tasks, start)
         history = History(len(seeds), plan.choices)
-        for carry, chunk in train(plan.algorithm, seeds, plan.rounds, -(-plan.rounds // CHUNKS), *given):
+        chunks = train(
+            plan.algorithm,
+            seeds,
+            plan.rounds,
+            -(-plan.rounds // CHUNKS),
+            *given,
+            begun=None
+            if checkpoints is None
+            else checkpoints.newest(carried(plan.algorithm, seeds, *given), history, plan.rounds),
+        )
+        for carry, chunk in chunks:
             history.add(chunk)
             steps = min(history.taken(position)[1] for position in range(len(seeds)))
             fraction = max(chunk.rounds / plan.rounds, steps / length if plan.ends_by_steps else 0.0)
             if on_chunk(history, min(fraction, 1.0)) or (plan.ends_by_steps and steps >= length):
                 break
+            if checkpoints is not None and chunk.rounds < plan.rounds:
+                checkpoints.after_chunk(carry, history, chunk.rounds)
     learned = plan.learned(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(seeds)], plan.of_carry(carry)))
     if isinstance(config, HAMQConfig):
         assert hierarchy is not None

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
-from lodestone.cli import discover, plan, pretrain, reproduce, train, watch
+from lodestone.cli import discover, plan, pretrain, reproduce, resume, train, watch
 from lodestone.devices import use_all_cores
 from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS
@@ -20,6 +20,7 @@ from lodestone.experiments.registry import EXPERIMENTS
 COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "reproduce": reproduce.run,
     "train": train.run,
+    "resume": resume.run,
     "pretrain": pretrain.run,
     "watch": watch.run,
     "plan": plan.run,
@@ -34,6 +35,7 @@ Hierarchical reinforcement learning with options, each learner beside the exact 
 commands:
   reproduce                  the paper's two figures, or another experiment: figures, report, numbers
   train AGENT ENVIRONMENT    train an agent ({", ".join(AGENTS)})
+  resume RUN                 go on with a training run that was ended early, to the same bits
   pretrain ENVIRONMENT       train an environment's options as Q-networks
   watch RUN                  play a saved policy
   plan ENVIRONMENT           the exact optimum
@@ -62,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except LodestoneError as error:
         print(f"lodestone: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("\nlodestone: interrupted.", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"\nlodestone: {str(interrupt) or 'interrupted.'}", file=sys.stderr)
         return 130
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -15,11 +15,12 @@ from rich.table import Table
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig, as_configured
 from lodestone.agents.playing import episodes_to_judge, play_many
-from lodestone.agents.run_folder import RunFolder, load_run
-from lodestone.agents.saved import UnitedPolicy, load_options
+from lodestone.agents.run import Run, load_start
+from lodestone.agents.run_folder import RunFolder
+from lodestone.agents.saved import AnyPolicy, load_options
 from lodestone.agents.training import AGENTS, AgentConfig, check_training, train_policy
 from lodestone.cli.parsing import parse, settings_of, take_environment, take_name
-from lodestone.cli.printing import print_json
+from lodestone.cli.printing import note, print_json
 from lodestone.console import ConsoleProgress
 from lodestone.envs.base import Environment, OutsideEnvironment
 from lodestone.envs.host import Registered
@@ -65,7 +66,9 @@ class Train(Generic[AgentT, EnvironmentT]):
     from_run: Path | None = None
     """Of a united network: the run, or policy file, of one to start from. One with pooling may be of another grid."""
     out: Path | None = None
-    """Folder for config.json, metrics.jsonl and policy.safetensors; without it nothing is saved."""
+    """Folder for the run, from which `lodestone resume` goes on if it is ended early; without it nothing is saved."""
+    checkpoint_every: float = 60.0
+    """Seconds from one checkpoint in the folder to the next, at least; 0 for one after every report of progress."""
     json: bool = False
     """Print one JSON object at the end."""
 
@@ -76,59 +79,93 @@ def run(words: list[str]) -> None:
     name, environment, rest = take_environment(f"train {agent}", rest)
     if issubclass(environment, OutsideEnvironment):  # which has a limit of its own
         rest = ["--decision-limit", "None", *rest]
-    _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest), agent)
+    _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest))
 
 
-def _train(train: Train, agent: str) -> None:
+def _train(train: Train) -> None:
     if train.seeds < 1:
         raise InvalidConfig(f"seeds is {train.seeds}, but must be at least 1.")
-    if train.steps < 1:
-        raise InvalidConfig(f"steps is {train.steps}, but must be at least 1.")
     environment, rules = train.environment, train.rules
     options = _choose_options(train)
-    start = None if train.from_run is None else _load_start(train.from_run)
+    start = None if train.from_run is None else load_start(train.from_run)
     check_training(train.agent, environment, options, rules, start)
     if isinstance(train.agent, MAXQConfig):
         _warn_of_unsafe_abstraction(train.agent, environment, rules.discount)
-    seeds = tuple(range(train.seed, train.seed + train.seeds))
-    folder = None
-    if train.out is not None:
-        config = {
-            "agent": {"name": agent, **dataclasses.asdict(train.agent)},
-            "environment": describe_environment(environment),
-            "rules": dataclasses.asdict(rules),
-            "options": list(options.names),
-            "from_run": None if train.from_run is None else str(train.from_run),
-            "steps": train.steps,
-            "seeds": list(seeds),
-        }
-        folder = RunFolder(train.out, config)
-    with ConsoleProgress(1.0) as progress:
-        name = environment.id if isinstance(environment, Registered) else describe_environment(environment)["name"]
-        progress.begin(f"{agent} on {name}", 1.0)
+    run = Run(
+        agent=train.agent,
+        environment=environment,
+        rules=rules,
+        options=options,
+        steps=train.steps,
+        seeds=tuple(range(train.seed, train.seed + train.seeds)),
+        start=start,
+        from_run=None if train.from_run is None else str(train.from_run),
+        checkpoint_every=train.checkpoint_every,
+    )
+    if train.out is None:
+        _print_result(run, None, *_train_policy(run, None), train.json)
+        return
+    with RunFolder(train.out) as folder:
+        folder.begin(run)
+        finish(run, folder, train.json)
+
+
+def finish(run: Run, folder: RunFolder, as_json: bool) -> None:
+    """Train what is left of a run, save it and print what came of it."""
+    try:
+        policy, history = _train_policy(run, folder)
+        folder.finish(policy)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; `lodestone resume {folder.path}` goes on.") from None
+    _print_result(run, folder.path, policy, history, as_json)
+
+
+def _train_policy(run: Run, folder: RunFolder | None) -> tuple[AnyPolicy, History]:
+    with ConsoleProgress(1.0) as progress, ExitStack() as stack:
+        checkpoints = None
+        if folder is not None and not isinstance(run.environment, OutsideEnvironment):
+            checkpoints = stack.enter_context(folder.checkpoints(run.checkpoint_every, note))
+        elif folder is not None:
+            note("A Gymnasium environment keeps its state to itself: there are no checkpoints, a run begins again.")
+        world = run.environment
+        name = world.id if isinstance(world, Registered) else describe_environment(world)["name"]
+        progress.begin(f"{run.agent_name} on {name}", 1.0)
 
         def tell(history: History, fraction: float) -> bool:
-            steps = min(history.taken(position)[1] for position in range(len(seeds)))
-            returns = [history.episodes(position).total_reward[-50:] for position in range(len(seeds))]
+            seeds = range(len(run.seeds))
+            steps = min(history.taken(position)[1] for position in seeds)
+            returns = [history.episodes(position).total_reward[-50:] for position in seeds]
             means = " ".join(f"{values.mean():.1f}" if len(values) else "-" for values in returns)
-            progress.advance(max(fraction, min(1.0, steps / train.steps)), f"{steps:,} steps, mean return {means}")
+            done = max(fraction, min(1.0, steps / run.steps))
+            progress.skip(done * history.restored / len(history.usage))
+            progress.advance(done, f"{steps:,} steps, mean return {means}")
             if folder is not None:
-                folder.log(history, seeds)
-            return steps >= train.steps
+                folder.log(history, run.seeds)
+            return steps >= run.steps
 
-        policy, history = train_policy(train.agent, environment, options, rules, train.steps, seeds, tell, start=start)
-    if folder is not None:
-        folder.finish(policy)
+        return train_policy(
+            run.agent,
+            run.environment,
+            run.options,
+            run.rules,
+            run.steps,
+            run.seeds,
+            tell,
+            start=run.start,
+            checkpoints=checkpoints,
+        )
 
+
+def _print_result(run: Run, out: Path | None, policy: AnyPolicy, history: History, as_json: bool) -> None:
     try:
-        best = optimum(environment)
+        best = optimum(run.environment)
     except TooManyStates:
         best = None
     judged = episodes_to_judge(policy)
     greedy = jax.tree.map(lambda leaf: leaf.mean(axis=1), play_many(policy, jax.random.key(0), judged))
     content: dict[str, Any] = {
-        "agent": agent,
-        "environment": describe_environment(environment),
+        "agent": run.agent_name,
+        "environment": describe_environment(run.environment),
         "optimal_return": best.optimal_return if best else None,
         "optimal_steps": best.optimal_steps if best else None,
         "seeds": [
@@ -143,16 +180,16 @@ def _train(train: Train, agent: str) -> None:
                 "success": float(greedy.success[position]),
                 "gap": best.optimal_return - float(greedy.total_reward[position]) if best else None,
             }
-            for position, seed in enumerate(seeds)
+            for position, seed in enumerate(run.seeds)
         ],
         "greedy_episodes": judged,
         "seconds": round(history.seconds, 3),
-        "out": str(train.out) if train.out else None,
+        "out": None if out is None else str(out),
     }
-    if train.json:
+    if as_json:
         print_json(content)
         return
-    ended = "terminated" if isinstance(environment, OutsideEnvironment) else "reached the goal"
+    ended = "terminated" if isinstance(run.environment, OutsideEnvironment) else "reached the goal"
     title = f"Greedy policies after training ({history.seconds:.0f} s)"
     table = Table(title=title if judged == 1 else f"{title}, means of {judged} episodes", title_justify="left")
     for column in ("seed", "steps trained", "return", "optimal return", "steps", "decisions", ended):
@@ -168,15 +205,8 @@ def _train(train: Train, agent: str) -> None:
             f"{row['success']:.0%}",
         )
     Console().print(table)
-    if train.out is not None:
-        print(f"Saved in {train.out}; `lodestone watch {train.out}` plays it.")
-
-
-def _load_start(path: Path) -> UnitedPolicy:
-    policy = load_run(path)
-    if not isinstance(policy, UnitedPolicy):
-        raise InvalidConfig(f"{path} holds a policy of {policy.agent}; only a united network can be started from.")
-    return policy
+    if out is not None:
+        print(f"Saved in {out}; `lodestone watch {out}` plays it.")
 
 
 def _choose_options(train: Train) -> Options:
@@ -207,4 +237,4 @@ def _warn_of_unsafe_abstraction(config: MAXQConfig, environment: Environment, di
         check_abstraction(tasks, tables, recursive_optimum(tasks, tables, discount))
     except InvalidTaskGraph as error:
         hint = "try --discount 1 or --no-abstraction"
-        print(f"lodestone: note: {error} What is learned is not exact; {hint}.", file=sys.stderr)
+        note(f"{error} What is learned is not exact; {hint}.")

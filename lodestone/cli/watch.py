@@ -9,7 +9,7 @@ import jax
 from tyro.conf import Positional
 
 from lodestone.agents.playing import record
-from lodestone.agents.run_folder import load_run
+from lodestone.agents.run import load_run
 from lodestone.cli.parsing import parse
 from lodestone.errors import InvalidConfig
 from lodestone.files import prepare_folder

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lodestone.learning.loop import Chunk
+from lodestone.learning.named_arrays import Arrays, take
 
 
 class Episodes(NamedTuple):
@@ -48,6 +49,8 @@ class History:
         self._episodes: list[list[np.ndarray]] = [[] for _ in range(seeds)]
         self._taken = np.zeros((seeds, 2), dtype=np.int64)  # decisions, steps
         self.usage: list[Usage] = []
+        self.restored = 0
+        """Chunks that another process brought."""
 
     def add(self, chunk: Chunk) -> None:
         """Append what a chunk brought."""
@@ -76,9 +79,36 @@ class History:
 
     def episodes(self, seed: int) -> Episodes:
         """The finished episodes of the seed with this position."""
-        rows = np.concatenate(self._episodes[seed], axis=1) if self._episodes[seed] else np.zeros((6, 0))
+        rows = self._rows(seed)
         whole = rows.astype(np.int64)
         return Episodes(whole[0], whole[1], rows[2], whole[3], whole[4], rows[5] > 0)
+
+    def _rows(self, seed: int) -> Float[np.ndarray, "6 E"]:
+        return np.concatenate(self._episodes[seed], axis=1) if self._episodes[seed] else np.zeros((6, 0))
+
+    def arrays(self) -> Arrays:
+        """Everything, by name."""
+        episodes = {f"episodes/{seed}": self._rows(seed) for seed in range(self.seeds)}
+        usage = {f"usage/{name}": np.stack([getattr(each, name) for each in self.usage]) for name in Usage._fields}
+        return {"taken": self._taken.copy(), **episodes, **usage}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Become what gave these arrays, after at least one chunk. Raises `BadFile`."""
+        seeds, options, whole = self.seeds, len(self.choices), np.int64
+        taken = take(arrays, "taken", (seeds, 2), whole)
+        episodes = [take(arrays, f"episodes/{seed}", (6, None), np.float64) for seed in range(seeds)]
+        seconds = take(arrays, "usage/seconds", (None,), np.float64)
+        chunks = len(seconds)
+        usage = zip(
+            take(arrays, "usage/decisions", (chunks, seeds), whole),
+            take(arrays, "usage/calls", (chunks, seeds, options), whole),
+            take(arrays, "usage/steps", (chunks, seeds, options), whole),
+            take(arrays, "usage/loss", (chunks, seeds), np.float32),
+            seconds.tolist(),
+            strict=True,
+        )
+        self._taken, self._episodes = taken, [[rows] for rows in episodes]
+        self.usage, self.restored = [Usage(*row) for row in usage], chunks
 
     @property
     def seconds(self) -> float:

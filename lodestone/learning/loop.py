@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from lodestone.errors import Diverged, InvalidConfig
 from lodestone.options.execution import Decision
@@ -72,13 +72,30 @@ class Chunk(NamedTuple):
     """Wall-clock time since the start of training, compilation included."""
 
 
+class Begun(NamedTuple):
+    """Where training goes on that was begun before."""
+
+    carry: Any
+    """What the seeds carried, with a leading seed axis."""
+    rounds: int
+    """Rounds that were over."""
+    seconds: float
+    """Wall-clock time that they had taken."""
+
+
 def train(
-    algorithm: Algorithm, seeds: Sequence[int], rounds: int, rounds_per_chunk: int, *start: PyTree
+    algorithm: Algorithm,
+    seeds: Sequence[int],
+    rounds: int,
+    rounds_per_chunk: int,
+    *start: PyTree,
+    begun: Begun | None = None,
 ) -> Iterator[tuple[Any, Chunk]]:
     """Train all seeds at once for so many rounds each; yields (carry, chunk) after every chunk of rounds.
 
-    The carry has a leading seed axis and is valid until the next chunk is asked for (its memory is then reused).
-    `start`, with a leading seed axis, is what `algorithm.init` takes beside the key. Seeds do not influence one
+    The carry has a leading seed axis, on which seeds may be repeated after the last, and is valid until the next chunk
+    is asked for (its memory is then reused). `start`, with a leading seed axis, is what `algorithm.init` takes beside
+    the key; `begun` goes on from the end of a chunk, to the same bits on the same machine. Seeds do not influence one
     another. Raises `Diverged` when a loss is no longer finite.
     """
     if not seeds:
@@ -91,9 +108,11 @@ def train(
     positions = np.arange(len(seeds) + -len(seeds) % len(devices)) % len(seeds)  # every device gets equally many
     mesh = Mesh(np.array(devices), ("seeds",))
     over_seeds, everywhere = PartitionSpec("seeds"), PartitionSpec()
-    keys = jnp.stack([jax.random.key(seed) for seed in seeds])
-    given = jax.tree.map(lambda leaf: leaf[positions], (keys, *start))
-    given = jax.device_put(given, NamedSharding(mesh, over_seeds))
+
+    def place(tree: PyTree) -> PyTree:
+        repeated = jax.jit(partial(jax.tree.map, lambda leaf: leaf[positions]))(tree)
+        return jax.device_put(repeated, NamedSharding(mesh, over_seeds))
+
     spread = partial(jax.shard_map, mesh=mesh, check_vma=False)
     init = jax.jit(spread(jax.vmap(algorithm.init), in_specs=over_seeds, out_specs=over_seeds))
     run_chunk = jax.jit(
@@ -105,14 +124,27 @@ def train(
         donate_argnums=0,
     )
 
-    started = perf_counter()
-    carry = init(*given)
-    for first in range(0, rounds, rounds_per_chunk):
+    started, over = perf_counter(), 0
+    if begun is None:
+        carry = init(*place((_keys(seeds), *start)))
+    else:
+        carry, over, started = place(begun.carry), begun.rounds, started - begun.seconds
+        del begun  # what it carried takes as much memory as the run
+    for first in range(over, rounds, rounds_per_chunk):
         count = min(rounds_per_chunk, rounds - first)
         carry, log = run_chunk(carry, jnp.int32(first), jnp.int32(count))
         log = jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[: len(seeds), :count], log)
         _require_finite(log.loss, seeds)
         yield carry, Chunk(log, first + count, perf_counter() - started)
+
+
+def carried(algorithm: Algorithm, seeds: Sequence[int], *start: PyTree) -> Any:
+    """Shapes and dtypes of what `train` carries from round to round."""
+    return jax.eval_shape(jax.vmap(algorithm.init), _keys(seeds), *start)
+
+
+def _keys(seeds: Sequence[int]) -> PRNGKeyArray:
+    return jnp.stack([jax.random.key(seed) for seed in seeds])
 
 
 def _run_chunk(
