@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
-from lodestone.cli import discover, plan, pretrain, reproduce, resume, train, watch
+from lodestone.cli import discover, plan, pretrain, report, reproduce, resume, train, watch
 from lodestone.devices import use_all_cores
 from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS
@@ -23,6 +23,7 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "resume": resume.run,
     "pretrain": pretrain.run,
     "watch": watch.run,
+    "report": report.run,
     "plan": plan.run,
     "discover": discover.run,
 }
@@ -38,6 +39,7 @@ commands:
   resume RUN                 go on with a training run that was ended early, to the same bits
   pretrain ENVIRONMENT       train an environment's options as Q-networks
   watch RUN                  play a saved policy
+  report RUN ...             a page about training runs: curves, comparisons, an episode of each
   plan ENVIRONMENT           the exact optimum
   discover ENVIRONMENT       find options by --method {", ".join(METHODS)}
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from lodestone.agents.playing import Playback
 from lodestone.experiments.comparison import Gate
 from lodestone.learning.progress import Progress
 from lodestone.planning.joint import JointProcess
@@ -74,6 +75,8 @@ class Study:
     tables: tuple[NumberTable, ...]
     gates: tuple[Gate, ...]
     machines: tuple[LearnedMachines, ...] = ()
+    playbacks: tuple[Playback, ...] = ()
+    """Episodes to click through."""
 
 
 @dataclass(frozen=True)

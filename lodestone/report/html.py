@@ -73,7 +73,7 @@ def write_report(
 
 def write_player(playback: Playback, path: str | Path) -> None:
     """Write a page with the player of one episode. Raises `CannotWrite`."""
-    write_page(f"{playback.agent}, seed {playback.seed}", _player(playback), path)
+    write_page(f"{playback.agent}, seed {playback.seed}", player(playback), path)
 
 
 # --------------------------------------------------------------------------------------------------- the page's parts
@@ -88,7 +88,7 @@ def _comparison(comparison: Comparison) -> str:
     if comparison.agents:
         parts += [_curves(comparison), _results(comparison)]
     if comparison.playback is not None:
-        parts.append(_player(comparison.playback))
+        parts.append(player(comparison.playback))
     if comparison.agents:
         parts.append(_usage(comparison))
     if comparison.options:
@@ -203,7 +203,8 @@ def _estimate(summary: Summary) -> str:
 # -------------------------------------------------------------------------------------------------------- the player
 
 
-def _player(playback: Playback) -> str:
+def player(playback: Playback) -> str:
+    """The player of one episode, as a part of a page."""
     colours = option_colours(playback.option_names, playback.action_names)
     frames: dict[bytes, int] = {}  # picture -> its number; an action without effect shows the same picture again
     frame = [frames.setdefault(picture.tobytes(), len(frames)) for picture in playback.pictures]

@@ -21,6 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from lodestone.experiments.study import LearnedMachines, NumberTable, Panel, Series, Study
 from lodestone.files import json_safe, write_atomically, write_json
 from lodestone.report.curves import POINTS, STYLE, Curve, draw_curve, panel_svg, save_figure, thousands
+from lodestone.report.html import player
 from lodestone.report.machine_picture import edge_counts, hierarchy_svg
 from lodestone.report.page import (
     AGENT_COLOURS,
@@ -294,6 +295,8 @@ def write_study_report(study: Study, settings: Mapping[str, object], path: str |
     if study.machines:
         parts.append("<h2>Machines</h2>")
         parts += [_drawing(each.title, svg_of(each), number) for number, each in enumerate(study.machines)]
+    if study.playbacks:
+        parts += ["<h2>Episodes</h2>", *map(player, study.playbacks)]
     parts.append(settings_section(settings))
     write_page(study.title, "\n".join(parts), path)
 
