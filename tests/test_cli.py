@@ -392,3 +392,14 @@ def test_help_and_version(capsys):
     code, out, _ = run(capsys, "train", "dqn", "magnet-arm", "--help")
     assert code == 0
     assert "--tower-height" in out
+
+
+def test_the_doctor_says_what_is_here(capsys):
+    code, out, _ = run(capsys, "doctor", "--json")
+    found = json.loads(out)
+    assert code == 0
+    assert found["packages"]["jax"] == jax.__version__
+    assert len(found["devices"]) == jax.device_count()
+    code, out, _ = run(capsys, "doctor")
+    assert code == 0
+    assert "devices" in out

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
-from lodestone.cli import discover, plan, pretrain, report, reproduce, resume, train, watch
+from lodestone.cli import discover, doctor, plan, pretrain, report, reproduce, resume, train, watch
 from lodestone.devices import use_all_cores
 from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS
@@ -26,6 +26,7 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "report": report.run,
     "plan": plan.run,
     "discover": discover.run,
+    "doctor": doctor.run,
 }
 """What each command does with the words after its name."""
 
@@ -42,6 +43,7 @@ commands:
   report RUN ...             a page about training runs: curves, comparisons, an episode of each
   plan ENVIRONMENT           the exact optimum
   discover ENVIRONMENT       find options by --method {", ".join(METHODS)}
+  doctor                     what is installed here, what is missing, and how to get it
 
 environments: {", ".join(ENVIRONMENTS)}
 experiments: {", ".join((reproduce.MAGNET_TOWER, *EXPERIMENTS))}
