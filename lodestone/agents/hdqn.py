@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
-from lodestone.envs.base import Environment, example_state, observation_shape
+from lodestone.envs.base import Environment, allowed_actions, example_state, observation_shape, remembered
 from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig, check_name
 from lodestone.learning.adam import adam_step, start_adam
@@ -201,7 +201,7 @@ def controller_batch(
             reward=scale * rewards[step.goal],
             discount=jnp.where(done, 0.0, discount),
             next_obs=(environment.observe(step.next_state), step.goal),
-            next_available=jnp.ones(environment.num_actions, dtype=bool),
+            next_available=allowed_actions(environment, step.next_state),
         )
 
     return jax.vmap(one)(steps)
@@ -272,7 +272,7 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
 
     def init(key: PRNGKeyArray) -> Carry:
         network_key, actor_key, key = jax.random.split(key, 3)
-        state = example_state(environment)
+        state = remembered(environment, example_state(environment))
         seen, actions = observation_shape(environment), environment.num_actions
         network = init_goal_network(config.network, config.shared, seen, actions, len(goals), network_key)
         as_options = GoalOptions(goals, network, jnp.zeros(len(goals)), config.goal_cap)
@@ -308,7 +308,8 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
             if not config.repeat_goals:
                 allowed = jax.vmap(without_repeat)(moved.next_available, moved.action)
                 decisions = decisions._replace(transition=moved._replace(next_available=allowed))
-            return after, (decisions, Pursued(actors.state, moved.action, decisions.action, moved.next_obs))
+            before = jax.vmap(partial(remembered, environment))(actors.state)
+            return after, (decisions, Pursued(before, moved.action, decisions.action, moved.next_obs))
 
         actors, brought = jax.lax.scan(step, actors, jax.random.split(key, config.ticks_per_round))
         decisions, pursued = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), brought)

@@ -181,6 +181,13 @@ def sample_step(environment: Environment, key: PRNGKeyArray, state: State, actio
     return next_step(environment, jax.random.uniform(key), state, action)
 
 
+def allowed_actions(environment: Environment, state: State) -> Bool[Array, " A"]:
+    """The primitive actions that may be taken in a state."""
+    if isinstance(environment, OutsideEnvironment):
+        return environment.allowed(state)
+    return jnp.ones(environment.num_actions, dtype=bool)
+
+
 def remembered(environment: Environment, state: State) -> State:
     """What a memory keeps of a state."""
     return environment.remember(state) if isinstance(environment, OutsideEnvironment) else state

@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from lodestone.envs.base import allowed_actions
 from lodestone.envs.task import Task
 from lodestone.errors import InvalidConfig
 from lodestone.learning.networks import NetworkConfig, QNetwork, Trunk
+from lodestone.learning.policies import greedy
 from lodestone.learning.united_network import Shared, each_head, init_trunk_and_heads, stack_heads
 from lodestone.options.base import Options
 from lodestone.types import Observation, State
@@ -91,10 +93,10 @@ class GoalOptions(Options):
 
     def action_probs(self, state: State) -> Float[Array, "G A"]:
         values = self.network.action_values(self.goals[0].observe(state))
-        actions = self.goals[0].num_actions
-        best = jax.nn.one_hot(jnp.argmax(values, axis=1), actions)
-        epsilon = self.epsilon[:, None]
-        return (1 - epsilon) * best + epsilon / actions
+        allowed = allowed_actions(self.goals[0].environment, state)
+        best = jax.vmap(greedy, in_axes=(0, None))(values, allowed)
+        epsilon, may = self.epsilon[:, None], allowed[None].astype(jnp.float32)
+        return (1 - epsilon) * jax.nn.one_hot(best, allowed.size) + epsilon * may / jnp.sum(may)
 
     def termination(self, state: State) -> Float[Array, " G"]:
         return self._holds(state).astype(jnp.float32)

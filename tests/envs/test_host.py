@@ -12,11 +12,13 @@ import pytest
 from gymnasium import spaces
 
 from lodestone.agents.dqn import DQNConfig, dqn
+from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.playing import play_many
 from lodestone.agents.saved import Policy, load_policy, save_policy
 from lodestone.agents.training import train_policy
 from lodestone.envs.host import FromFunction, HostEnvironment, Registered, visit
 from lodestone.envs.registry import make_environment
+from lodestone.envs.task import goal
 from lodestone.errors import EnvironmentFailed, InvalidConfig, TooManyStates
 from lodestone.learning.loop import train
 from lodestone.learning.networks import NetworkConfig
@@ -188,3 +190,22 @@ def test_a_file_does_not_import_what_it_likes():
     with pytest.raises(InvalidConfig, match="has to be imported before"):
         make_environment("gymnasium", id="antigravity:Fly-v0")
     assert make_environment("gymnasium", id="CartPole-v1") == Registered("CartPole-v1")
+
+
+def is_at(place):
+    return lambda environment, state: state.seen.observation[0] == place
+
+
+def test_hdqn_learns_to_reach_goals_of_ones_own(walk):
+    """What the controller remembers is what happened, and whose goal it was."""
+    goals = tuple(goal(walk, f"at {place}", is_at(place)) for place in (1, 3))
+    config = HDQNConfig(network=SMALL.network, environments=3, learning_starts=8, max_goal_steps=4)
+    with visit(walk):
+        for carry, _ in train(hdqn(config, walk, goals, Rules(discount=0.5), 200), [0], config.rounds(200), 50):
+            steps = jax.tree.map(lambda leaf: np.asarray(leaf)[0], carry.learner.steps)
+    kept = jax.tree.map(lambda leaf: leaf[: steps.size], steps.storage)
+    found = list(zip(*kept.state.seen.observation.T, kept.action, kept.next_state.seen.observation[:, 0], strict=True))
+    for copy in {one[1] for one in found}:
+        assert [(one[0], *one[2:]) for one in found if one[1] == copy] == [
+            (before, action, after) for number, before, action, *_, after in LOG if number == copy
+        ]
