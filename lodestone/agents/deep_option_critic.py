@@ -1,4 +1,4 @@
-"""Option-critic with a network (Bacon, Harb and Precup 2017), on-policy, in many environments at once (Harb et al. 2018).
+"""Option-critic with a network, on-policy, in many environments at once (Bacon et al. 2017; Harb et al. 2018).
 
 What `option_critic` has in tables are here heads on one trunk: Q(s, o), pi_o(.|s) = softmax(theta / temperature) and
 beta_o(s) = sigmoid(vartheta). A round takes some steps in every environment with the network as it is; then it climbs
@@ -200,9 +200,7 @@ def _each(function):
     return jax.vmap(jax.vmap(function))
 
 
-def deep_option_critic(
-    config: DeepOptionCriticConfig, environment: Environment, rules: Rules, steps: int
-) -> Algorithm:
+def deep_option_critic(config: DeepOptionCriticConfig, environment: Environment, rules: Rules, steps: int) -> Algorithm:
     """The algorithm for the training loop. Schedules are fractions of `steps`.
 
     Raises `InvalidConfig` for rules under which an option's reward is not the discounted sum of its steps' rewards or a

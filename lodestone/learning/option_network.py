@@ -18,7 +18,7 @@ from lodestone.envs.state_space import reachable_states
 from lodestone.learning.networks import Linear, NetworkConfig, Trunk, build_layers, draw_weights, weight_shapes
 from lodestone.options.base import NO_CAP, Options
 from lodestone.options.soft import numbered_names
-from lodestone.types import Observation, State
+from lodestone.types import State
 
 
 class OptionNetwork(eqx.Module):
@@ -65,7 +65,7 @@ def sight(environment: Environment) -> Callable[[State], Num[Array, "..."]]:
 
     Raises `TooManyStates` where these numbers cannot be counted.
     """
-    seen = jax.eval_shape(environment.observe, example_state(environment))
+    seen = jax.eval_shape(lambda state: environment.observe(state), example_state(environment))
     if seen.shape or not jnp.issubdtype(seen.dtype, jnp.integer):
         return environment.observe
     with jax.ensure_compile_time_eval():
