@@ -175,8 +175,7 @@ def loss(
         if not config.termination_trains_trunk:
             features = jax.lax.stop_gradient(features)
         stop = jax.nn.sigmoid(network.exits(features)[option])
-        arriving, advantage = arriving_value(values, jax.lax.stop_gradient(stop), option, weights.epsilon, cost)
-        return stop, arriving, advantage
+        return stop, *arriving_value(values, stop, option, weights.epsilon, cost)
 
     reward = config.reward_scale * _each(environment.reward)(steps.state, steps.action, steps.next_state)
     values, log_probs, entropies = _each(here)(steps.state, steps.option, steps.action)

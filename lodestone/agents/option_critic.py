@@ -92,6 +92,11 @@ class Learned(NamedTuple):
     exits: Float[Array, "S O"]
     """vartheta."""
 
+    @property
+    def num_options(self) -> int:
+        """O."""
+        return self.table.shape[-1]
+
 
 def nothing_learned(shape: tuple[int, ...], num_actions: int) -> Learned:
     """Zeros for [S, O] pairs, or for several seeds of them."""

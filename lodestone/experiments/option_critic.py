@@ -21,6 +21,7 @@ from lodestone.envs.four_rooms import NUMBER, Dynamics, FourRooms
 from lodestone.envs.task import endless
 from lodestone.experiments.changing_world import Moving, changing_world
 from lodestone.experiments.comparison import Gate, at_least, at_most
+from lodestone.experiments.following import at_looks
 from lodestone.experiments.study import Experiment, NumberTable, Panel, Series, Study
 from lodestone.learning.history import History
 from lodestone.learning.loop import Algorithm, train
@@ -283,11 +284,7 @@ def _over_training(runs: dict[str, Run]) -> list[Panel]:
     x = np.linspace(0, 2 * EPISODES, 101)
 
     def series(name: str, one: Run, looked: Float[np.ndarray, "C N"]) -> Series:
-        rows = [
-            np.insert(values, 0, np.nan)[np.searchsorted(finished, x, side="right")]
-            for finished, values in zip(one.finished.T, looked.T, strict=True)
-        ]
-        return Series(name, x, np.stack(rows))
+        return Series(name, x, at_looks(one.finished, looked, x))
 
     lengths = tuple(series(name, one, one.length) for name, one in runs.items())
     stops = tuple(series(name, one, one.stops) for name, one in runs.items())
