@@ -20,6 +20,7 @@ Q(s, o) is. Nothing is worth anything after an end of the environment, and every
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -63,8 +64,8 @@ class DeepOptionCriticConfig:
     """Whether the terminations' gradient goes on into the trunk; in the authors' code it does not."""
     decay: float = 0.9
     """lambda: 0 for targets of one step, 1 for targets as long as the round."""
-    entropy: Knots = ((0.0, 0.1), (1.0, 0.0))
-    """Weight of the policies' entropy over the run."""
+    entropy: Knots = ((0.0, 0.3), (1.0, 0.01))
+    """Weight of the policies' entropy over the run, beside scaled rewards: it has to last until a reward is found."""
     deliberation_cost: float = 0.0
     """xi: what the end of an option costs where the episode goes on, in units of the environment's reward."""
     epsilon: Knots = ((0.0, 0.1),)
@@ -123,7 +124,7 @@ class Steps(NamedTuple):
     """Whether the option ended."""
 
 
-class Weights(NamedTuple):
+class Scheduled(NamedTuple):
     """What changes over the run."""
 
     learning_rate: Float[Array, ""]
@@ -159,7 +160,7 @@ def loss(
     discount: float,
     network: OptionNetwork,
     steps: Steps,
-    weights: Weights,
+    now: Scheduled,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """What falls along the gradients above, as a mean over steps; and the critic's mean squared error."""
     cost, see = config.reward_scale * config.deliberation_cost, sight(environment)
@@ -175,7 +176,7 @@ def loss(
         if not config.termination_trains_trunk:
             features = jax.lax.stop_gradient(features)
         stop = jax.nn.sigmoid(network.exits(features)[option])
-        return stop, *arriving_value(values, stop, option, weights.epsilon, cost)
+        return stop, *arriving_value(values, stop, option, now.epsilon, cost)
 
     reward = config.reward_scale * _each(environment.reward)(steps.state, steps.action, steps.next_state)
     values, log_probs, entropies = _each(here)(steps.state, steps.option, steps.action)
@@ -191,10 +192,10 @@ def loss(
     of_critic = jnp.mean(jnp.square(errors))
     of_policy = jnp.mean(jax.lax.stop_gradient(errors) * log_probs)
     of_terminations = jnp.mean(jnp.where(steps.terminated, 0.0, stops * advantages))
-    return 0.5 * of_critic - of_policy + of_terminations - weights.entropy * jnp.mean(entropies), of_critic
+    return 0.5 * of_critic - of_policy + of_terminations - now.entropy * jnp.mean(entropies), of_critic
 
 
-def _each(function):
+def _each(function: Callable) -> Callable:
     """Of T steps in N environments."""
     return jax.vmap(jax.vmap(function))
 
@@ -242,18 +243,18 @@ def deep_option_critic(config: DeepOptionCriticConfig, environment: Environment,
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`ticks_per_round` steps of every environment, then one step along the gradients."""
         fraction = number.astype(jnp.float32) / rounds
-        weights = Weights(
+        now = Scheduled(
             *(piecewise_linear(knots, fraction) for knots in (config.learning_rate, config.entropy, config.epsilon))
         )
         steps_key, key = jax.random.split(carry.key)
-        actors, (decisions, taken) = take_steps(carry, steps_key, weights.epsilon)
+        actors, (decisions, taken) = take_steps(carry, steps_key, now.epsilon)
 
         def of_network(network: OptionNetwork) -> tuple[Array, Array]:
-            return loss(config, environment, rules.discount, network, taken, weights)
+            return loss(config, environment, rules.discount, network, taken, now)
 
         (_, error), gradient = jax.value_and_grad(of_network, has_aux=True)(carry.network)
         network, adam = adam_step(
-            carry.network, gradient, carry.adam, weights.learning_rate, config.adam_epsilon, config.max_gradient_norm
+            carry.network, gradient, carry.adam, now.learning_rate, config.adam_epsilon, config.max_gradient_norm
         )
         decisions = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), decisions)
         return Carry(network, adam, actors, key), log_round(decisions, error)

@@ -42,7 +42,6 @@ STEPS = 600_000
 FOUR, FLAT, GREEDY, COSTLY = "4 options", "actor-critic", "4 options, epsilon 0", "4 options, deliberation cost"
 _FOUR = DeepOptionCriticConfig(
     network=NetworkConfig(kernels=(3,), strides=(3,), channels=(16,), hidden=(128,)),
-    entropy=((0.0, 0.3), (1.0, 0.01)),
     reward_scale=0.2,
 )
 CONFIGS = {

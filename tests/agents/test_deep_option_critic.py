@@ -17,8 +17,8 @@ from scipy.special import expit, log_softmax, softmax
 from lodestone.agents.deep_option_critic import (
     Carry,
     DeepOptionCriticConfig,
+    Scheduled,
     Steps,
-    Weights,
     deep_option_critic,
     loss,
 )
@@ -62,7 +62,7 @@ LIVELY = DeepOptionCriticConfig(
     reward_scale=2.0,
 )
 RULES = Rules(discount=GAMMA, step_limit=7)
-NO_ENTROPY = Weights(jnp.float32(1), jnp.float32(0), jnp.float32(EPSILON))
+NO_ENTROPY = Scheduled(jnp.float32(1), jnp.float32(0), jnp.float32(EPSILON))
 
 
 @cache
@@ -94,7 +94,7 @@ def as_tables(network: OptionNetwork) -> Learned:
 
 
 @partial(jax.jit, static_argnums=0)
-def gradient(config: DeepOptionCriticConfig, network: OptionNetwork, steps: Steps, weights: Weights) -> OptionNetwork:
+def gradient(config: DeepOptionCriticConfig, network: OptionNetwork, steps: Steps, weights: Scheduled) -> OptionNetwork:
     """Of what falls."""
     return jax.grad(lambda one: loss(config, WORLD, GAMMA, one, steps, weights)[0])(network)
 
@@ -266,7 +266,7 @@ def test_one_option_is_a_plain_actor_critic():
     """Whatever its termination says, and whenever it is said to have ended."""
     config = replace(LIVELY, num_options=1, deliberation_cost=0.0)
     network, steps = random_network((5,), num_options=1), random_steps((6, 3), num_options=1)
-    weights = Weights(jnp.float32(1), jnp.float32(0.2), jnp.float32(EPSILON))
+    weights = Scheduled(jnp.float32(1), jnp.float32(0.2), jnp.float32(EPSILON))
 
     def actor_critic(network: OptionNetwork) -> jax.Array:
         seen, seen_next = jnp.eye(NUM_STATES)[steps.state.number], jnp.eye(NUM_STATES)[steps.next_state.number]
