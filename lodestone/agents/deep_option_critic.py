@@ -30,7 +30,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from lodestone.agents.option_critic import chosen_value, refuse_rules
-from lodestone.envs.base import Environment
+from lodestone.envs.base import Environment, remembered
 from lodestone.errors import InvalidConfig
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.collecting import start_actors, tick_all
@@ -41,7 +41,6 @@ from lodestone.learning.option_network import (
     SoftNetworkOptions,
     init_option_network,
     shown_shape,
-    sight,
 )
 from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.returns import lambda_returns
@@ -163,15 +162,16 @@ def loss(
     now: Scheduled,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """What falls along the gradients above, as a mean over steps; and the critic's mean squared error."""
-    cost, see = config.reward_scale * config.deliberation_cost, sight(environment)
+    cost = config.reward_scale * config.deliberation_cost
+    options = SoftNetworkOptions(environment, network, config.temperature)
 
     def here(state: State, option: Array, action: Array) -> tuple[Array, Array, Array]:
-        features = network.trunk(see(state))
-        log_probs = jax.nn.log_softmax(network.theta(features)[option] / config.temperature)
+        features = options.features(state)
+        log_probs = options.log_probs(state, features)[option]
         return network.values(features)[option], log_probs[action], -jnp.sum(jnp.exp(log_probs) * log_probs)
 
     def there(state: State, option: Array) -> tuple[Array, Array, Array]:
-        features = network.trunk(see(state))
+        features = options.features(state)
         values = jax.lax.stop_gradient(network.values(features))
         if not config.termination_trains_trunk:
             features = jax.lax.stop_gradient(features)
@@ -228,7 +228,7 @@ def deep_option_critic(config: DeepOptionCriticConfig, environment: Environment,
         def step(actors: Actor, tick_key: PRNGKeyArray) -> tuple[Actor, tuple[Decision, Steps]]:
             after, decision = tick_all(environment, options, rules, tick_key, actors, choose)
             taken = Steps(
-                state=actors.state,
+                state=remembered(environment, actors.state),
                 option=decision.transition.action,
                 action=decision.action,
                 next_state=decision.transition.next_obs,

@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num, PRNGKeyArray
 
-from lodestone.envs.base import Environment, example_state
+from lodestone.envs.base import Environment, OutsideEnvironment, example_state
 from lodestone.envs.state_space import reachable_states
 from lodestone.learning.networks import Linear, NetworkConfig, Trunk, build_layers, draw_weights, weight_shapes
 from lodestone.options.base import NO_CAP, Options
 from lodestone.options.soft import numbered_names
 from lodestone.types import State
+
+FORBIDDEN = -1e9
+"""Preference for an action that is not allowed: none, but a number, as probability times logarithm has to be one."""
 
 
 class OptionNetwork(eqx.Module):
@@ -98,14 +101,22 @@ class SoftNetworkOptions(Options):
         return jnp.ones(self.size, dtype=bool)
 
     def action_probs(self, state: State) -> Float[Array, "O A"]:
-        return jax.nn.softmax(self.network.theta(self._features(state)) / self.temperature)
+        return jnp.exp(self.log_probs(state, self.features(state)))
 
     def termination(self, state: State) -> Float[Array, " O"]:
-        return jax.nn.sigmoid(self.network.exits(self._features(state)))
+        return jax.nn.sigmoid(self.network.exits(self.features(state)))
 
     def values(self, state: State) -> Float[Array, " O"]:
         """Q(s, .), as it is learned."""
-        return self.network.values(self._features(state))
+        return self.network.values(self.features(state))
 
-    def _features(self, state: State) -> Float[Array, " F"]:
+    def features(self, state: State) -> Float[Array, " F"]:
+        """What the heads work on."""
         return self.network.trunk(sight(self.environment)(state))
+
+    def log_probs(self, state: State, features: Float[Array, " F"]) -> Float[Array, "O A"]:
+        """Logarithms of the actions' probabilities under each option."""
+        theta = self.network.theta(features) / self.temperature
+        if isinstance(self.environment, OutsideEnvironment):
+            theta = jnp.where(self.environment.allowed(state)[None], theta, FORBIDDEN)
+        return jax.nn.log_softmax(theta)
