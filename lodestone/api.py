@@ -1,5 +1,6 @@
 """The names that most programs on top of Lodestone need, in one place."""
 
+from lodestone.agents.deep_option_critic import DeepOptionCriticConfig
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.hdqn import HDQNConfig
@@ -63,6 +64,7 @@ __all__ = [
     "CorridorMaze",
     "CoveringConfig",
     "DQNConfig",
+    "DeepOptionCriticConfig",
     "DiverseDensityConfig",
     "EigenoptionsConfig",
     "Environment",

@@ -29,7 +29,8 @@ from lodestone.options.execution import Rules
 from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
 TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
-SMALL = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32", "--learning-starts", "100"]
+SHAPE = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32"]
+SMALL = [*SHAPE, "--learning-starts", "100"]
 GOALS = ["--reward-scale", "0.2", "--discount", "0.97", "--max-goal-steps", "10"]
 
 
@@ -255,6 +256,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
         ("hdqn", ["magnet-arm", *TINY, *SMALL, *GOALS], "20000"),
         ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
+        ("deep-option-critic", ["magnet-arm", *TINY, *SHAPE, "--reward-scale", "0.2"], "80000"),
         ("sarsa", ["four-rooms", "--dynamics", "deterministic"], "60000"),
     ],
 )
@@ -306,6 +308,9 @@ REFUSED = [
     (["train", "option-critic", "four-rooms", "--call-cost", "0.5"], "call_cost is 0.5"),
     (["train", "option-critic", "four-rooms", "--temperature", "0"], "temperature is 0"),
     (["train", "united", "taxi"], "this environment has none"),
+    (["train", "deep-option-critic", "taxi", "--options", "fly"], "no option named 'fly'"),
+    (["train", "deep-option-critic", "four-rooms", "--decay", "2"], "decay is 2"),
+    (["train", "deep-option-critic", "four-rooms", "--no-bootstrap-at-limit"], "bootstrap_at_limit is False"),
     (["train", "hdqn", "taxi", "--out", "run"], "chooses among goals, and this environment has none"),
     (["train", "hdqn", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "hdqn", "chain", "--success-window", "3"], "success_window must hold"),

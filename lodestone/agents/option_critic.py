@@ -92,6 +92,11 @@ class Learned(NamedTuple):
     exits: Float[Array, "S O"]
     """vartheta."""
 
+    @property
+    def num_options(self) -> int:
+        """O."""
+        return self.table.shape[-1]
+
 
 def nothing_learned(shape: tuple[int, ...], num_actions: int) -> Learned:
     """Zeros for [S, O] pairs, or for several seeds of them."""
@@ -162,6 +167,16 @@ def improve_termination(
     return learned._replace(exits=learned.exits.at[state, option].add(-rate * stops * (1.0 - stops) * advantage))
 
 
+def refuse_rules(rules: Rules) -> None:
+    """Raise `InvalidConfig` for rules that option-critic does not learn under."""
+    for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
+        if getattr(rules, switch) != wanted:
+            raise InvalidConfig(
+                f"{switch} is {getattr(rules, switch)}, but option-critic takes each step's reward as it comes and a "
+                "limit for no end."
+            )
+
+
 def option_critic(config: OptionCriticConfig, environment: Environment, rules: Rules, steps: int) -> Algorithm:
     """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
     `steps`.
@@ -174,12 +189,7 @@ def option_critic(config: OptionCriticConfig, environment: Environment, rules: R
 
 def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rules: Rules, steps: int) -> Algorithm:
     """The same in a world of numbered states."""
-    for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
-        if getattr(rules, switch) != wanted:
-            raise InvalidConfig(
-                f"{switch} is {getattr(rules, switch)}, but option-critic takes each step's reward as it comes and a "
-                "limit for no end."
-            )
+    refuse_rules(rules)
     # The fields of `Chance`: options draw their actions and their ends.
     needed = (True, True, world.num_outcomes > 1, len(world.initial_states) > 1)
     everything = jnp.ones(config.num_options, dtype=bool)

@@ -5,7 +5,7 @@ Nothing else is run on loading: a file from a stranger can at worst be refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from lodestone import __version__
+from lodestone.agents.deep_option_critic import DeepOptionCriticConfig
 from lodestone.agents.option_critic import Learned, OptionCriticConfig, nothing_learned
 from lodestone.envs.base import Environment, observation_shape
 from lodestone.envs.registry import describe_environment, make_environment
@@ -25,7 +26,8 @@ from lodestone.errors import BadFile, InvalidConfig, LodestoneError, check_name
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.goal_network import GoalNetwork, GoalOptions, init_goal_network
 from lodestone.learning.named_arrays import Arrays, fill, named_arrays
-from lodestone.learning.networks import NetworkConfig, QNetwork, init_q_network
+from lodestone.learning.networks import Convolution, Linear, NetworkConfig, QNetwork, init_q_network
+from lodestone.learning.option_network import OptionNetwork, SoftNetworkOptions, init_option_network, shown_shape
 from lodestone.learning.united_execution import UnitedOptions, choices
 from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
 from lodestone.machines.catalogue import machines
@@ -176,26 +178,33 @@ class OptionCriticPolicy:
     rules: Rules
     temperature: float
     """Of the options' policies."""
-    learned: Learned
-    """With a leading seed axis."""
+    learned: Learned | OptionNetwork
+    """Tables or networks, with a leading seed axis."""
     seeds: tuple[int, ...]
+    reward_scale: float = 1.0
+    """Factor by which the learned values are larger than the environment's rewards."""
 
     @property
     def choices(self) -> tuple[str, ...]:
         """Names of the options."""
-        return numbered_names(self.learned.table.shape[2])
+        return numbered_names(self.learned.num_options)
 
-    def of_seed(self, position: int) -> Learned:
+    def of_seed(self, position: int) -> Learned | OptionNetwork:
         """What the seed at this position has learned."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.learned)
 
-    def options_of(self, learned: Learned) -> SoftOptions:
+    def options_of(self, learned: Learned | OptionNetwork) -> SoftOptions | SoftNetworkOptions:
         """The options of one seed."""
+        if isinstance(learned, OptionNetwork):
+            return SoftNetworkOptions(self.environment, learned, self.temperature)
         space = reachable_states(self.environment)
         return SoftOptions(space, learned.preferences, learned.exits, self.temperature)
 
-    def values_of(self, learned: Learned) -> Callable[[State], Float[Array, " O"]]:
+    def values_of(self, learned: Learned | OptionNetwork) -> Callable[[State], Float[Array, " O"]]:
         """Q(s, .) of one seed."""
+        if isinstance(learned, OptionNetwork):
+            values = SoftNetworkOptions(self.environment, learned, self.temperature).values
+            return lambda state: values(state) / self.reward_scale
         space = reachable_states(self.environment)
         return lambda state: learned.table[space.index_of(state)]
 
@@ -283,12 +292,17 @@ def _save_heads(path: Path, policy: UnitedPolicy | GoalPolicy) -> None:
 
 
 def _save_option_critic_policy(path: Path, policy: OptionCriticPolicy) -> None:
+    recipe: Recipe = {"num_options": policy.learned.num_options, "temperature": policy.temperature}
+    if isinstance(policy.learned, OptionNetwork):
+        trunk = policy.learned.trunk
+        shape = _describe_layers(trunk.convolutions, trunk.layers, trunk.pooling)
+        recipe |= {"shape": shape, "reward_scale": policy.reward_scale}
     header = {
         "kind": "policy",
         "version": __version__,
         "agent": policy.agent,
         "environment": describe_environment(policy.environment),
-        "option_critic": {"num_options": policy.learned.table.shape[2], "temperature": policy.temperature},
+        "option_critic": recipe,
         "rules": asdict(policy.rules),
         "seeds": list(policy.seeds),
     }
@@ -362,16 +376,29 @@ def _build_heads(
 
 
 def _build_option_critic_policy(environment: Environment, header: Recipe, arrays: Arrays) -> OptionCriticPolicy:
-    config, seeds = OptionCriticConfig(**header["option_critic"]), tuple(int(seed) for seed in header["seeds"])
-    shape = (len(seeds), reachable_states(environment).size, config.num_options)
-    template = jax.eval_shape(lambda: nothing_learned(shape, environment.num_actions))
+    recipe, seeds = dict(header["option_critic"]), tuple(int(seed) for seed in header["seeds"])
+    actions = environment.num_actions
+    if "shape" in recipe:
+        deep = DeepOptionCriticConfig(network=_build_shape(recipe.pop("shape")), **recipe)
+        seen, reward_scale = shown_shape(environment), deep.reward_scale
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), len(seeds)))
+        template: PyTree = jax.eval_shape(
+            jax.vmap(lambda key: init_option_network(deep.network, seen, deep.num_options, actions, key)), keys
+        )
+        temperature = deep.temperature
+    else:
+        config = OptionCriticConfig(**recipe)
+        shape = (len(seeds), reachable_states(environment).size, config.num_options)
+        template = jax.eval_shape(lambda: nothing_learned(shape, actions))
+        temperature, reward_scale = config.temperature, 1.0
     return OptionCriticPolicy(
         agent=str(header["agent"]),
         environment=environment,
         rules=Rules(**header["rules"]),
-        temperature=config.temperature,
+        temperature=temperature,
         learned=fill(template, arrays, "learned"),
         seeds=seeds,
+        reward_scale=reward_scale,
     )
 
 
@@ -472,13 +499,18 @@ def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Env
 
 def _describe_network(network: QNetwork) -> Recipe:
     """The shape of a network whose arrays have one leading axis."""
+    return _describe_layers(network.convolutions, network.layers[:-1], network.pooling)
+
+
+def _describe_layers(convolutions: Sequence[Convolution], hidden: Sequence[Linear], pooling: bool) -> Recipe:
+    """The same of its layers, without the last one."""
     return asdict(
         NetworkConfig(
-            kernels=tuple(layer.weight.shape[1] for layer in network.convolutions),
-            strides=tuple(layer.stride for layer in network.convolutions),
-            channels=tuple(layer.weight.shape[-1] for layer in network.convolutions),
-            hidden=tuple(layer.weight.shape[-1] for layer in network.layers[:-1]),
-            pooling=network.pooling,
+            kernels=tuple(layer.weight.shape[1] for layer in convolutions),
+            strides=tuple(layer.stride for layer in convolutions),
+            channels=tuple(layer.weight.shape[-1] for layer in convolutions),
+            hidden=tuple(layer.weight.shape[-1] for layer in hidden),
+            pooling=pooling,
         )
     )
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from lodestone.agents.deep_option_critic import DeepOptionCriticConfig, deep_option_critic
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
 from lodestone.agents.hdqn import HDQNConfig, hdqn
@@ -51,6 +52,7 @@ AgentConfig = (
     | SarsaConfig
     | IntraOptionConfig
     | OptionCriticConfig
+    | DeepOptionCriticConfig
     | MAXQConfig
     | HAMQConfig
 )
@@ -63,6 +65,7 @@ AGENTS: dict[str, type[AgentConfig]] = {
     "sarsa": SarsaConfig,
     "intra-option": IntraOptionConfig,
     "option-critic": OptionCriticConfig,
+    "deep-option-critic": DeepOptionCriticConfig,
     "maxq": MAXQConfig,
     "hamq": HAMQConfig,
 }
@@ -87,7 +90,7 @@ def train_policy(
     start: UnitedPolicy | None = None,
     checkpoints: Checkpoints | None = None,
 ) -> tuple[AnyPolicy, History]:
-    """Train all seeds at once for `length` decisions each (tabular agents, united networks and h-DQN: primitive steps).
+    """Train all seeds at once for `length` decisions each (all but DQN: primitive steps).
 
     HAMQ learns in `hierarchy`, MAXQ in `graph`, a united network the options that `tasks` are for, and h-DQN to choose
     among `tasks` as its goals (default: what the environment has ready-made); option-critic makes its own: their
@@ -151,8 +154,11 @@ def train_policy(
             ),
             history,
         )
-    if isinstance(config, OptionCriticConfig):
-        return OptionCriticPolicy(name, environment, rules, config.temperature, learned, tuple(seeds)), history
+    if isinstance(config, OptionCriticConfig | DeepOptionCriticConfig):
+        policy = OptionCriticPolicy(
+            name, environment, rules, config.temperature, learned, tuple(seeds), plan.reward_scale
+        )
+        return policy, history
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
@@ -232,6 +238,15 @@ def _plan(
                 rounds=-(-length // STEPS_PER_ROUND),
                 of_carry=lambda carry: carry.learned,
                 choices=numbered_names(config.num_options),
+            )
+        case DeepOptionCriticConfig():
+            _refuse_options("Option-critic", options, environment)
+            return _Plan(
+                algorithm=deep_option_critic(config, environment, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.network,
+                choices=numbered_names(config.num_options),
+                reward_scale=config.reward_scale,
             )
         case IntraOptionConfig():
             return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)

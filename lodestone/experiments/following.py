@@ -30,10 +30,7 @@ class Followed(NamedTuple):
     def at(self, counts: Int[np.ndarray, "C N"], grid: Float[np.ndarray, " X"]) -> Float[np.ndarray, "N X"]:
         """The last judgement of each seed at each point of `grid`, where `counts` is `episodes` or `steps`; not a
         number before the first."""
-        rows = []
-        for count, judged in zip(counts.T, self.judged.T, strict=True):
-            rows.append(np.insert(judged, 0, np.nan)[np.searchsorted(count, grid, side="right")])
-        return np.stack(rows)
+        return at_looks(counts, self.judged, grid)
 
     def episode_lengths(self, episodes: int) -> Float[np.ndarray, "N E"]:
         """Primitive steps of each seed's first episodes, means of the last ten; not a number where it did not finish so
@@ -44,6 +41,17 @@ class Followed(NamedTuple):
             steps = self.history.episodes(seed).length_steps[:episodes]
             lengths[seed, : len(steps)] = steps
         return np.stack([lengths[:, max(0, last - 9) : last + 1].mean(axis=1) for last in range(episodes)], axis=1)
+
+
+def at_looks(
+    counts: Float[np.ndarray, "C N"] | Int[np.ndarray, "C N"],
+    seen: Float[np.ndarray, "C N"],
+    grid: Float[np.ndarray, " X"],
+) -> Float[np.ndarray, "N X"]:
+    """What was seen of each seed at the last of C looks by each point of `grid`, if looks came at these counts; not a
+    number before the first."""
+    rows = zip(counts.T, seen.T, strict=True)
+    return np.stack([np.insert(row, 0, np.nan)[np.searchsorted(count, grid, side="right")] for count, row in rows])
 
 
 def follow(

@@ -29,6 +29,7 @@ from lodestone.errors import BadFile, InvalidConfig
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.goal_network import init_goal_network
 from lodestone.learning.networks import NetworkConfig, init_q_network
+from lodestone.learning.option_network import init_option_network
 from lodestone.learning.united_network import init_united_network
 from lodestone.options.base import Capped, Primitives, Union
 from lodestone.options.catalogue import goals, scripted_options, tasks
@@ -125,6 +126,55 @@ def test_learned_options_come_back(tmp_path):
         np.testing.assert_array_equal(*answers)
     np.testing.assert_allclose(found.options_of(one).termination(state), jax.nn.sigmoid(other.exits[0]))
     np.testing.assert_array_equal(play(found, jax.random.key(0)).steps, play(policy, jax.random.key(0)).steps)
+
+
+def deep_option_critic_policy() -> OptionCriticPolicy:
+    keys = jax.random.split(jax.random.key(0), 2)
+    made = jax.vmap(lambda key: init_option_network(SMALL, (12, 9, 3), 3, 6, key))(keys)
+    learned = jax.tree.map(lambda leaf: leaf + jax.random.normal(jax.random.key(1), leaf.shape), made)
+    return OptionCriticPolicy("deep-option-critic", ARM, Rules(step_limit=90), 0.5, learned, (4, 5), 0.1)
+
+
+def test_networks_of_learned_options_come_back(tmp_path):
+    policy = deep_option_critic_policy()
+    save_policy(tmp_path / "policy.safetensors", policy)
+    found = load_policy(tmp_path / "policy.safetensors")
+    for name in ("agent", "environment", "rules", "temperature", "seeds", "choices", "reward_scale"):
+        assert getattr(found, name) == getattr(policy, name)
+    jax.tree.map(np.testing.assert_array_equal, found.learned, policy.learned)
+    network, state = found.of_seed(1), example_state(ARM)
+    features = network.trunk(ARM.observe(state))
+    np.testing.assert_allclose(found.values_of(network)(state), network.values(features) / 0.1, rtol=1e-5)
+    options = found.options_of(network)
+    probs = jax.nn.softmax(network.preferences(features).reshape(3, 6) / 0.5)
+    np.testing.assert_allclose(options.action_probs(state), probs, rtol=1e-5)
+    np.testing.assert_allclose(options.termination(state), jax.nn.sigmoid(network.exits(features)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"num_options": 4},
+        {"num_options": "x"},
+        {"temperature": -1.0},
+        {"reward_scale": 0.0},
+        {"shape": 3},
+        {"shape": {"kernels": [3], "strides": [3], "channels": [4], "hidden": [9], "pooling": False}},
+        {"shape": {"kernels": [], "strides": [], "channels": [], "hidden": [], "pooling": True}},
+        {"heat": 1},
+        {"environments": 0},
+    ],
+)
+def test_hostile_recipes_of_learned_options_are_refused(wrong, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, deep_option_critic_policy())
+    arrays, header = read_arrays(path)
+    write_arrays(path, arrays, header | {"option_critic": header["option_critic"] | wrong})
+    with pytest.raises(BadFile):
+        load_policy(path)
+    write_arrays(path, {name: array for name, array in arrays.items() if "exits" not in name}, header)
+    with pytest.raises(BadFile, match="is missing"):
+        load_policy(path)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from lodestone.agents.deep_option_critic import DeepOptionCriticConfig
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.playing import play_many
@@ -165,6 +166,21 @@ def test_the_same_seeds_do_the_same_again(walk):
     Walk.made = 0
     seen.append(trained(walk, primitives(walk), 40))
     assert seen[0] == seen[1]
+
+
+def test_option_critic_takes_what_is_allowed(walk):
+    """A forbidden action fails; every step of every copy is taken once."""
+    config = DeepOptionCriticConfig(network=SMALL.network, environments=3)
+    policy, history = train_policy(config, walk, primitives(walk), Rules(discount=0.5), 400, [0, 1])
+    assert len(LOG) == 2 * config.rounds(400) * config.steps_per_round
+    copies = sorted({one[0] for one in LOG})
+    assert len(copies) == 6
+    assert any(one[1] == 0 for one in LOG)
+    assert any(one[5] for one in LOG), "no episode was cut"
+    ends = [sum(one[4] or one[5] for one in LOG if one[0] in of_seed) for of_seed in (copies[:3], copies[3:])]
+    found = [len(history.episodes(seed).total_reward) for seed in range(2)]
+    assert sorted(found) == sorted(ends)
+    assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
 
 
 def test_what_the_environment_raises_is_told(walk):

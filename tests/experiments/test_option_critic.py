@@ -11,9 +11,6 @@ from lodestone.learning.progress import Silent
 from lodestone.planning.solve import optimum, value_iteration
 from lodestone.planning.tables import tabulate
 
-SLOWER = "code: steps in the first 50 episodes after the move, 4 options / SARSA"
-"""Measured as 1.25 where less than 1 is required: docs/option-critic.md."""
-
 
 @pytest.mark.parametrize("number", [0, 7])
 def test_a_house_is_the_environment_with_its_goal(number):
@@ -50,8 +47,5 @@ def test_a_short_run_shows_every_learner(monkeypatch):
 
 
 @pytest.mark.slow
-def test_all_numbers_come_out_but_one():
-    gates = {gate.name: gate for gate in option_critic.run(20, Silent()).gates}
-    assert SLOWER in gates
-    assert [name for name, gate in gates.items() if not gate.passed] in ([], [SLOWER])
-    assert gates[SLOWER].measured < 2
+def test_all_numbers_come_out():
+    assert [gate.name for gate in option_critic.run(20, Silent()).gates if not gate.passed] == []
