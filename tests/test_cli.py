@@ -30,6 +30,7 @@ from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
 TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
 SMALL = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32", "--learning-starts", "100"]
+PLANS = ["--learning-rate", "0", "3e-3", "1", "1e-4", "--reward-scale", "0.02", "--discount", "0.97"]
 GOALS = ["--reward-scale", "0.2", "--discount", "0.97", "--max-goal-steps", "10"]
 
 
@@ -255,6 +256,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
         ("hdqn", ["magnet-arm", *TINY, *SMALL, *GOALS], "20000"),
         ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
+        ("straw", ["magnet-arm", *TINY, *SMALL[:-2], *PLANS], "60000"),
         ("sarsa", ["four-rooms", "--dynamics", "deterministic"], "60000"),
     ],
 )
@@ -309,6 +311,9 @@ REFUSED = [
     (["train", "hdqn", "taxi", "--out", "run"], "chooses among goals, and this environment has none"),
     (["train", "hdqn", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "hdqn", "chain", "--success-window", "3"], "success_window must hold"),
+    (["train", "straw", "goal-maze", "--horizon", "0"], "horizon is 0"),
+    (["train", "straw", "goal-maze", "--call-cost", "1"], "call_cost is 1"),
+    (["train", "straw", "magnet-arm", "--options", "lift"], "takes no options"),
     (["train", "united", "magnet-arm", "--option-cap", "5"], "option_cap is given, but no options are"),
     (["train", "united", "magnet-arm", "--from-run", "nowhere", "--out", "run"], "nowhere"),
     (["train", "united", "magnet-arm", "--training", "manager", "--out", "run"], "needs a trained network to start"),

@@ -19,7 +19,16 @@ from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values
 from lodestone.agents.option_critic import OptionCriticConfig, option_critic
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.sarsa import SarsaConfig, sarsa
-from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
+from lodestone.agents.saved import (
+    AnyPolicy,
+    GoalPolicy,
+    MachinePolicy,
+    OptionCriticPolicy,
+    PlanPolicy,
+    Policy,
+    UnitedPolicy,
+)
+from lodestone.agents.straw import StrawConfig, straw
 from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment, OutsideEnvironment, observation_shape
 from lodestone.envs.host import visit
@@ -51,6 +60,7 @@ AgentConfig = (
     | SarsaConfig
     | IntraOptionConfig
     | OptionCriticConfig
+    | StrawConfig
     | MAXQConfig
     | HAMQConfig
 )
@@ -63,6 +73,7 @@ AGENTS: dict[str, type[AgentConfig]] = {
     "sarsa": SarsaConfig,
     "intra-option": IntraOptionConfig,
     "option-critic": OptionCriticConfig,
+    "straw": StrawConfig,
     "maxq": MAXQConfig,
     "hamq": HAMQConfig,
 }
@@ -87,13 +98,14 @@ def train_policy(
     start: UnitedPolicy | None = None,
     checkpoints: Checkpoints | None = None,
 ) -> tuple[AnyPolicy, History]:
-    """Train all seeds at once for `length` decisions each (tabular agents, united networks and h-DQN: primitive steps).
+    """Train all seeds at once for `length` decisions each (tabular agents, united networks, h-DQN and STRAW: primitive
+    steps).
 
     HAMQ learns in `hierarchy`, MAXQ in `graph`, a united network the options that `tasks` are for, and h-DQN to choose
-    among `tasks` as its goals (default: what the environment has ready-made); option-critic makes its own: their
-    `options` must be the primitive actions. What MAXQ leaves is the policy that asks anew from the root down at every
-    step. A united network starts as that of `start`, the first seed as its first one and so on, in turn; it may have
-    been trained on another grid if its shape has `pooling`.
+    among `tasks` as its goals (default: what the environment has ready-made); option-critic and STRAW make their own:
+    the `options` of all these must be the primitive actions. What MAXQ leaves is the policy that asks anew from the
+    root down at every step. A united network starts as that of `start`, the first seed as its first one and so on, in
+    turn; it may have been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True. With `checkpoints` the run goes on from the newest one, and writes more; the other arguments must be the same
     as before.
@@ -153,6 +165,9 @@ def train_policy(
         )
     if isinstance(config, OptionCriticConfig):
         return OptionCriticPolicy(name, environment, rules, config.temperature, learned, tuple(seeds)), history
+    if isinstance(config, StrawConfig):
+        shape = config.network
+        return PlanPolicy(name, environment, rules, shape, learned, config.reward_scale, tuple(seeds)), history
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
@@ -232,6 +247,14 @@ def _plan(
                 rounds=-(-length // STEPS_PER_ROUND),
                 of_carry=lambda carry: carry.learned,
                 choices=numbered_names(config.num_options),
+            )
+        case StrawConfig():
+            _refuse_options("STRAW", options, environment)
+            return _Plan(
+                algorithm=straw(config, environment, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.network,
+                choices=("plan",),
             )
         case IntraOptionConfig():
             return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)
