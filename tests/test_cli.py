@@ -30,7 +30,6 @@ from lodestone.options.four_rooms import HALLWAY_OPTIONS
 
 TINY = ["--rows", "3", "--columns", "3", "--bricks", "2", "--tower-height", "2"]
 SMALL = ["--kernels", "3", "--strides", "3", "--channels", "8", "--hidden", "32", "--learning-starts", "100"]
-PLANS = ["--learning-rate", "0", "3e-3", "1", "1e-4", "--reward-scale", "0.02", "--discount", "0.97"]
 GOALS = ["--reward-scale", "0.2", "--discount", "0.97", "--max-goal-steps", "10"]
 
 
@@ -256,7 +255,6 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
         ("hdqn", ["magnet-arm", *TINY, *SMALL, *GOALS], "20000"),
         ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
-        ("straw", ["magnet-arm", *TINY, *SMALL[:-2], *PLANS], "60000"),
         ("sarsa", ["four-rooms", "--dynamics", "deterministic"], "60000"),
     ],
 )

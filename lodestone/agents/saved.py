@@ -330,7 +330,7 @@ def _save_plan_policy(path: Path, policy: PlanPolicy) -> None:
         "reward_scale": policy.reward_scale,
         "seeds": list(policy.seeds),
     }
-    write_arrays(path, _named_arrays(policy.networks, "learned"), header)
+    write_arrays(path, named_arrays(policy.networks, "learned"), header)
 
 
 def load_policy(path: Path) -> AnyPolicy:
@@ -426,7 +426,7 @@ def _build_plan_policy(environment: Environment, header: Recipe, arrays: Arrays)
         environment=environment,
         rules=Rules(**header["rules"]),
         shape=shape,
-        networks=_fill(template, arrays, "learned"),
+        networks=fill(template, arrays, "learned"),
         reward_scale=float(header["reward_scale"]),
         seeds=seeds,
     )

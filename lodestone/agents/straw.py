@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, observation_shape
+from lodestone.envs.base import Environment, OutsideEnvironment, observation_shape
 from lodestone.errors import InvalidConfig
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
@@ -242,8 +242,10 @@ def straw(config: StrawConfig, environment: Environment, rules: Rules, steps: in
     """The algorithm for the training loop. `steps`, the run's length, is what schedules are fractions of.
 
     Raises `InvalidConfig` for rules under which an option's reward is not the discounted sum of its steps' rewards or a
-    limit is an end.
+    limit is an end, and for environments outside the program, whose allowed actions a plan cannot know.
     """
+    if isinstance(environment, OutsideEnvironment):
+        raise InvalidConfig("STRAW plans steps ahead of what may be done there: it takes no Gymnasium environment.")
     for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
         if getattr(rules, switch) != wanted:
             raise InvalidConfig(
