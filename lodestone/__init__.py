@@ -12,6 +12,7 @@ for _id, _name, _step_limit in (
     ("lodestone/Taxi-v0", "taxi", 200),
     ("lodestone/CorridorMaze-v0", "corridor-maze", 2000),
     ("lodestone/TwoRooms-v0", "two-rooms", 100),
+    ("lodestone/GoalMaze-v0", "goal-maze", 100),
     ("lodestone/Chain-v0", "chain", 100),
     ("lodestone/RandomMDP-v0", "random-mdp", 100),
 ):

@@ -15,12 +15,14 @@ from lodestone.agents.saved import (
     GoalPolicy,
     MachinePolicy,
     OptionCriticPolicy,
+    PlanPolicy,
     Policy,
     load_options,
     load_policy,
     save_options,
     save_policy,
 )
+from lodestone.agents.straw import StrawConfig
 from lodestone.agents.training import train_policy
 from lodestone.devices import use_all_cores
 from lodestone.discovery.betweenness import BetweennessConfig
@@ -33,6 +35,7 @@ from lodestone.envs.base import Environment
 from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
+from lodestone.envs.goal_maze import GoalMaze
 from lodestone.envs.host import FromFunction, Registered
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.option_env import HostOption, OptionEnv
@@ -43,6 +46,7 @@ from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
 from lodestone.learning.checkpoints import Checkpoints
 from lodestone.learning.networks import NetworkConfig
+from lodestone.learning.plan_network import PlanConfig
 from lodestone.machines.machine import Hierarchy, Machine, every_action
 from lodestone.options.base import Capped, Options, Primitives, Union, primitives
 from lodestone.options.catalogue import named_options, scripted_options
@@ -70,6 +74,7 @@ __all__ = [
     "Environment",
     "FourRooms",
     "FromFunction",
+    "GoalMaze",
     "GoalPolicy",
     "HAMQConfig",
     "HDQNConfig",
@@ -87,6 +92,8 @@ __all__ = [
     "OptionCriticPolicy",
     "OptionEnv",
     "Options",
+    "PlanConfig",
+    "PlanPolicy",
     "Playback",
     "Policy",
     "Primitives",
@@ -98,6 +105,7 @@ __all__ = [
     "SarsaConfig",
     "Script",
     "Scripted",
+    "StrawConfig",
     "Subgoal",
     "Subtask",
     "Task",

@@ -10,12 +10,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
-from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
-from lodestone.envs.base import OutsideEnvironment
+from lodestone.agents.saved import (
+    AnyPolicy,
+    GoalPolicy,
+    MachinePolicy,
+    OptionCriticPolicy,
+    PlanPolicy,
+    Policy,
+    UnitedPolicy,
+)
+from lodestone.envs.base import Environment, OutsideEnvironment
 from lodestone.envs.host import visit
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
+from lodestone.learning.plan_execution import NEXT_PLAN, play_plans, trace_plans
+from lodestone.learning.plan_network import Plan
 from lodestone.learning.united_execution import play_united, trace_united
 from lodestone.options.base import Options
+from lodestone.types import State
 
 MAX_STEPS = 5000
 """Primitive steps after which an episode is given up where the policy's rules have no limit that ends it sooner."""
@@ -48,6 +59,8 @@ class Playback:
     option has none."""
     total_reward: Float[np.ndarray, " T"]
     """Return so far, after each step."""
+    ahead: tuple[str, ...] = ()
+    """What is planned at each step for those to come, in words; empty where nothing plans."""
 
 
 def play(policy: AnyPolicy, key: PRNGKeyArray) -> Episode:
@@ -66,6 +79,8 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
         if isinstance(policy, UnitedPolicy):
             return play_united(policy.environment, policy.rules, policy.option_cap, learned, key, MAX_STEPS)
+        if isinstance(policy, PlanPolicy):
+            return play_plans(policy.environment, policy.rules, learned, key, MAX_STEPS)
         options, values = _options(policy, learned), policy.values_of(learned)
         return play_episode(policy.environment, options, policy.rules, values, key, MAX_STEPS)
 
@@ -77,9 +92,9 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
         return jax.tree.map(np.asarray, run(_learned(policy), jnp.stack([keys] * len(policy.seeds))))
 
 
-def _learned(policy: Policy | UnitedPolicy | GoalPolicy | OptionCriticPolicy) -> PyTree:
+def _learned(policy: Policy | UnitedPolicy | GoalPolicy | OptionCriticPolicy | PlanPolicy) -> PyTree:
     """What it has learned, with a leading seed axis."""
-    return policy.networks if isinstance(policy, UnitedPolicy | GoalPolicy) else policy.learned
+    return policy.networks if isinstance(policy, UnitedPolicy | GoalPolicy | PlanPolicy) else policy.learned
 
 
 def _options(policy: Policy | GoalPolicy | OptionCriticPolicy, learned: PyTree) -> Options:
@@ -113,10 +128,13 @@ def _play_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> J
 
 def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
     """One greedy episode of the seed at this position, with its pictures. Of h-DQN the options are its goals; of
-    machines they are the edges of their choices: an edge runs until the next choice."""
+    machines they are the edges of their choices: an edge runs until the next choice. Of what plans the only option is
+    its plan, which runs until the next one."""
     if isinstance(policy, MachinePolicy):
         return _record_machines(policy, position, key, agent)
     length = int(play(policy, key).steps[position])
+    if isinstance(policy, PlanPolicy):
+        return _record_plans(policy, position, key, agent, length)
 
     @jax.jit
     def run(key: PRNGKeyArray) -> Trace:
@@ -129,18 +147,12 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
 
     with visit(policy.environment, film=True) as film:
         trace = jax.tree.map(np.asarray, run(key))
-    if isinstance(policy.environment, OutsideEnvironment):
-        pictures = film
-    else:
-        states = [jax.tree.map(lambda leaf, step=step: leaf[step], trace.state) for step in range(length)]
-        states.append(jax.tree.map(lambda leaf: leaf[-1], trace.next_state))
-        pictures = [policy.environment.render(state) for state in states]
     return Playback(
         agent=agent,
         seed=policy.seeds[position],
         option_names=policy.options.names if isinstance(policy, Policy) else policy.choices,
         action_names=policy.environment.action_names,
-        pictures=np.stack(pictures),
+        pictures=_pictures(policy.environment, trace.state, trace.next_state, length, film),
         option=trace.option,
         chosen=trace.chosen,
         action=trace.action,
@@ -149,6 +161,56 @@ def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> P
         termination=trace.termination,
         total_reward=np.cumsum(trace.reward),
     )
+
+
+def _pictures(
+    environment: Environment,
+    state: State,
+    next_state: State,
+    length: int,
+    film: list[UInt8[np.ndarray, "height width 3"]],
+) -> UInt8[np.ndarray, "T+1 height width 3"]:
+    """Before every step, and after the last; of an environment outside, what was filmed on the way."""
+    if isinstance(environment, OutsideEnvironment):
+        return np.stack(film)
+    states = [jax.tree.map(lambda leaf, step=step: leaf[step], state) for step in range(length)]
+    states.append(jax.tree.map(lambda leaf: leaf[-1], next_state))
+    return np.stack([environment.render(one) for one in states])
+
+
+def _record_plans(policy: PlanPolicy, position: int, key: PRNGKeyArray, agent: str, length: int) -> Playback:
+    environment = policy.environment
+    run = jax.jit(lambda key: trace_plans(environment, policy.rules, policy.network(position), key, length))
+    with visit(environment, film=True) as film:
+        trace = jax.tree.map(np.asarray, run(key))
+    return Playback(
+        agent=agent,
+        seed=policy.seeds[position],
+        option_names=("plan",),
+        action_names=environment.action_names,
+        pictures=_pictures(environment, trace.state, trace.next_state, length, film),
+        option=np.zeros(length, dtype=np.int32),
+        chosen=trace.anew,
+        action=trace.action,
+        values=trace.plan.logits[:, -1, :1] / policy.reward_scale,
+        available=np.ones((length, 1), dtype=bool),
+        termination=trace.before[:, None],
+        total_reward=np.cumsum(trace.reward),
+        ahead=tuple(
+            _in_words(environment.action_names, jax.tree.map(lambda leaf, step=step: leaf[step], trace.plan))
+            for step in range(length)
+        ),
+    )
+
+
+def _in_words(action_names: tuple[str, ...], plan: Plan) -> str:
+    """The likeliest actions after this step's, up to the step for which the next plan is expected, and with which
+    probability it is made there."""
+    due = np.append(plan.commitment >= NEXT_PLAN, True)
+    steps = int(np.argmax(due))
+    best = plan.logits[:-1, 1 : steps + 1].argmax(axis=0)
+    chance = plan.commitment[steps] if steps < len(plan.commitment) else 1.0
+    return ", ".join([*(action_names[action] for action in best), f"a new plan ({chance:.2f})"])
 
 
 def _record_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:

@@ -28,6 +28,7 @@ from lodestone.learning.goal_network import GoalNetwork, GoalOptions, init_goal_
 from lodestone.learning.named_arrays import Arrays, fill, named_arrays
 from lodestone.learning.networks import Convolution, Linear, NetworkConfig, QNetwork, init_q_network
 from lodestone.learning.option_network import OptionNetwork, SoftNetworkOptions, init_option_network, shown_shape
+from lodestone.learning.plan_network import PlanConfig, PlanNetwork, init_plan_network
 from lodestone.learning.united_execution import UnitedOptions, choices
 from lodestone.learning.united_network import Shared, UnitedNetwork, init_united_network
 from lodestone.machines.catalogue import machines
@@ -209,7 +210,27 @@ class OptionCriticPolicy:
         return lambda state: learned.table[space.index_of(state)]
 
 
-AnyPolicy = Policy | MachinePolicy | UnitedPolicy | GoalPolicy | OptionCriticPolicy
+@dataclass(frozen=True)
+class PlanPolicy:
+    """Trained networks that plan, of one or more seeds."""
+
+    agent: str
+    """Name of the algorithm."""
+    environment: Environment
+    rules: Rules
+    shape: NetworkConfig
+    networks: PlanNetwork
+    """With a leading seed axis."""
+    reward_scale: float
+    """Factor by which the planned values are larger than the environment's rewards."""
+    seeds: tuple[int, ...]
+
+    def network(self, position: int) -> PlanNetwork:
+        """Of the seed at this position."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[position]), self.networks)
+
+
+AnyPolicy = Policy | MachinePolicy | UnitedPolicy | GoalPolicy | OptionCriticPolicy | PlanPolicy
 
 
 def save_policy(path: Path, policy: AnyPolicy) -> None:
@@ -222,6 +243,9 @@ def save_policy(path: Path, policy: AnyPolicy) -> None:
         return
     if isinstance(policy, OptionCriticPolicy):
         _save_option_critic_policy(path, policy)
+        return
+    if isinstance(policy, PlanPolicy):
+        _save_plan_policy(path, policy)
         return
     recipe, arrays = _describe_options(policy.options, "options")
     network = _describe_network(policy.learned) if isinstance(policy.learned, QNetwork) else None
@@ -309,6 +333,20 @@ def _save_option_critic_policy(path: Path, policy: OptionCriticPolicy) -> None:
     write_arrays(path, named_arrays(policy.learned, "learned"), header)
 
 
+def _save_plan_policy(path: Path, policy: PlanPolicy) -> None:
+    header = {
+        "kind": "policy",
+        "version": __version__,
+        "agent": policy.agent,
+        "environment": describe_environment(policy.environment),
+        "plans": {"shape": asdict(policy.shape), "plan": asdict(policy.networks.shape)},
+        "rules": asdict(policy.rules),
+        "reward_scale": policy.reward_scale,
+        "seeds": list(policy.seeds),
+    }
+    write_arrays(path, named_arrays(policy.networks, "learned"), header)
+
+
 def load_policy(path: Path) -> AnyPolicy:
     """Raises `BadFile`."""
     arrays, header = _read(path, "policy")
@@ -322,6 +360,8 @@ def load_policy(path: Path) -> AnyPolicy:
                 return _build_heads(kind, header[name], environment, header, arrays)
         if "option_critic" in header:
             return _build_option_critic_policy(environment, header, arrays)
+        if "plans" in header:
+            return _build_plan_policy(environment, header, arrays)
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
@@ -399,6 +439,23 @@ def _build_option_critic_policy(environment: Environment, header: Recipe, arrays
         learned=fill(template, arrays, "learned"),
         seeds=seeds,
         reward_scale=reward_scale,
+    )
+
+
+def _build_plan_policy(environment: Environment, header: Recipe, arrays: Arrays) -> PlanPolicy:
+    recipe, seeds = header["plans"], tuple(int(seed) for seed in header["seeds"])
+    shape, plan = _build_shape(recipe["shape"]), PlanConfig(**recipe["plan"])
+    seen, rows = observation_shape(environment), environment.num_actions + 1
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), len(seeds)))
+    template = jax.eval_shape(jax.vmap(lambda key: init_plan_network(shape, plan, seen, rows, key)), keys)
+    return PlanPolicy(
+        agent=str(header["agent"]),
+        environment=environment,
+        rules=Rules(**header["rules"]),
+        shape=shape,
+        networks=fill(template, arrays, "learned"),
+        reward_scale=float(header["reward_scale"]),
+        seeds=seeds,
     )
 
 

@@ -20,7 +20,16 @@ from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values
 from lodestone.agents.option_critic import OptionCriticConfig, option_critic
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.sarsa import SarsaConfig, sarsa
-from lodestone.agents.saved import AnyPolicy, GoalPolicy, MachinePolicy, OptionCriticPolicy, Policy, UnitedPolicy
+from lodestone.agents.saved import (
+    AnyPolicy,
+    GoalPolicy,
+    MachinePolicy,
+    OptionCriticPolicy,
+    PlanPolicy,
+    Policy,
+    UnitedPolicy,
+)
+from lodestone.agents.straw import StrawConfig, straw
 from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment, OutsideEnvironment, observation_shape
 from lodestone.envs.host import visit
@@ -53,6 +62,7 @@ AgentConfig = (
     | IntraOptionConfig
     | OptionCriticConfig
     | DeepOptionCriticConfig
+    | StrawConfig
     | MAXQConfig
     | HAMQConfig
 )
@@ -66,6 +76,7 @@ AGENTS: dict[str, type[AgentConfig]] = {
     "intra-option": IntraOptionConfig,
     "option-critic": OptionCriticConfig,
     "deep-option-critic": DeepOptionCriticConfig,
+    "straw": StrawConfig,
     "maxq": MAXQConfig,
     "hamq": HAMQConfig,
 }
@@ -93,10 +104,10 @@ def train_policy(
     """Train all seeds at once for `length` decisions each (all but DQN: primitive steps).
 
     HAMQ learns in `hierarchy`, MAXQ in `graph`, a united network the options that `tasks` are for, and h-DQN to choose
-    among `tasks` as its goals (default: what the environment has ready-made); option-critic makes its own: their
-    `options` must be the primitive actions. What MAXQ leaves is the policy that asks anew from the root down at every
-    step. A united network starts as that of `start`, the first seed as its first one and so on, in turn; it may have
-    been trained on another grid if its shape has `pooling`.
+    among `tasks` as its goals (default: what the environment has ready-made); option-critic and STRAW make their own:
+    the `options` of all these must be the primitive actions. What MAXQ leaves is the policy that asks anew from the
+    root down at every step. A united network starts as that of `start`, the first seed as its first one and so on, in
+    turn; it may have been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True. With `checkpoints` the run goes on from the newest one, and writes more; the other arguments must be the same
     as before.
@@ -159,6 +170,9 @@ def train_policy(
             name, environment, rules, config.temperature, learned, tuple(seeds), plan.reward_scale
         )
         return policy, history
+    if isinstance(config, StrawConfig):
+        shape = config.network
+        return PlanPolicy(name, environment, rules, shape, learned, config.reward_scale, tuple(seeds)), history
     return Policy(name, environment, options, rules, learned, plan.reward_scale, tuple(seeds)), history
 
 
@@ -247,6 +261,14 @@ def _plan(
                 of_carry=lambda carry: carry.network,
                 choices=numbered_names(config.num_options),
                 reward_scale=config.reward_scale,
+            )
+        case StrawConfig():
+            _refuse_options("STRAW", options, environment)
+            return _Plan(
+                algorithm=straw(config, environment, rules, length),
+                rounds=config.rounds(length),
+                of_carry=lambda carry: carry.network,
+                choices=("plan",),
             )
         case IntraOptionConfig():
             return _tables(intra_option_q_learning(config, environment, options, rules, length), options, length)

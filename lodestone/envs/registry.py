@@ -10,6 +10,7 @@ from lodestone.envs.base import Environment
 from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
+from lodestone.envs.goal_maze import GoalMaze
 from lodestone.envs.host import Registered
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.random_mdp import RandomMDP
@@ -22,6 +23,7 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
     "four-rooms": FourRooms,
     "taxi": Taxi,
     "corridor-maze": CorridorMaze,
+    "goal-maze": GoalMaze,
     "two-rooms": TwoRooms,
     "chain": Chain,
     "random-mdp": RandomMDP,

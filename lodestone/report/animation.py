@@ -18,6 +18,8 @@ MIN_WIDTH = 360
 """Pixels; smaller pictures are enlarged by a whole factor."""
 STRIP = 62
 """Height of the strip under the picture, in pixels."""
+LINE = 24
+"""Height of one more line in the strip: of what is planned, where something is."""
 STEP_MS, END_MS = 600, 3000
 
 
@@ -51,7 +53,8 @@ def _frame(playback: Playback, step: int) -> Image.Image:
     picture = Image.fromarray(playback.pictures[step])
     scale = -(-MIN_WIDTH // picture.width)
     picture = picture.resize((picture.width * scale, picture.height * scale), Image.Resampling.NEAREST)
-    frame = Image.new("RGB", (picture.width, picture.height + STRIP), "white")
+    strip = STRIP + (LINE if playback.ahead else 0)
+    frame = Image.new("RGB", (picture.width, picture.height + strip), "white")
     frame.paste(picture)
     draw = ImageDraw.Draw(frame)
     top, left, right = picture.height, 12, picture.width - 12
@@ -77,6 +80,9 @@ def _frame(playback: Playback, step: int) -> Image.Image:
     doing = _shortened(f"{since} · {playback.action_names[action]}", _font(12), right - left - 90)
     draw.text((left, top + 46), doing, INK if chosen_at == step else MUTED, _font(12), anchor="lm")
     draw.text((right, top + 46), f"step {step + 1} of {total}", MUTED, _font(12), anchor="rm")
+    if playback.ahead:
+        then = _shortened(f"then {playback.ahead[step]}", _font(12), right - left)
+        draw.text((left, top + 70), then, INK, _font(12), anchor="lm")
     return frame
 
 

@@ -225,6 +225,7 @@ def player(playback: Playback) -> str:
         "termination": playback.termination.astype(np.float64).round(3) if stops else None,
         "hasSay": has_say,
         "onArrival": [on_arrival(playback, step) for step in range(len(playback.option))],
+        "ahead": playback.ahead or None,
         "reward": playback.total_reward.astype(np.float64).round(3),
     }
     # A script ends at the first "</script", whatever stands around it.
@@ -234,6 +235,7 @@ def player(playback: Playback) -> str:
     if stops:
         heading = f'<div class="headings">{heading}<h3>β(s)<span> stops here</span></h3></div>'
         hint = " β: probability that the option, had it run until here, would stop here; framed: the one that had run."
+    ahead = '<dt>Then</dt><dd class="ahead"></dd>\n' if playback.ahead else ""
     name = f"Greedy episode of {escape(playback.agent)}, seed {playback.seed}"
     return f"""<div class="card">
 <h3>{name}</h3>
@@ -245,7 +247,7 @@ def player(playback: Playback) -> str:
 <dl class="facts">
 <dt>Option</dt><dd><span class="pill"></span><span class="since"></span></dd>
 <dt>Primitive action</dt><dd class="action"></dd>
-<dt>Return so far</dt><dd class="return"></dd>
+{ahead}<dt>Return so far</dt><dd class="return"></dd>
 </dl>
 {heading}
 <ul class="bars"></ul>

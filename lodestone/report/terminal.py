@@ -26,6 +26,8 @@ def show(playback: Playback, delay: float) -> None:
     if not console.is_terminal:
         for step in range(length):
             console.print(_line(playback, step), highlight=False, soft_wrap=True)
+            if playback.ahead:
+                console.print(f"          then {playback.ahead[step]}", highlight=False, soft_wrap=True)
         return
     with Live(console=console, refresh_per_second=20) as live:
         for step in range(length):
@@ -58,7 +60,8 @@ def _screen(playback: Playback, step: int, picture: UInt8[np.ndarray, "height wi
             beta = playback.termination[step, index]
             cells.append("" if np.isnan(beta) else f"{beta:.2f}")
         values.add_row(*cells, style=style)
-    return Group(half_blocks(picture), Text(_line(playback, step)), values)
+    ahead = [Text(f"then {playback.ahead[step]}")] if playback.ahead else []
+    return Group(half_blocks(picture), Text(_line(playback, step)), *ahead, values)
 
 
 def half_blocks(picture: UInt8[np.ndarray, "height width 3"]) -> Text:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from lodestone.agents.option_critic import nothing_learned
-from lodestone.agents.playing import play
+from lodestone.agents.playing import play, record
 from lodestone.agents.saved import (
     GoalPolicy,
     OptionCriticPolicy,
+    PlanPolicy,
     Policy,
     UnitedPolicy,
     load_options,
@@ -30,6 +31,7 @@ from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.goal_network import init_goal_network
 from lodestone.learning.networks import NetworkConfig, init_q_network
 from lodestone.learning.option_network import init_option_network
+from lodestone.learning.plan_network import PlanConfig, init_plan_network
 from lodestone.learning.united_network import init_united_network
 from lodestone.options.base import Capped, Primitives, Union
 from lodestone.options.catalogue import goals, scripted_options, tasks
@@ -190,6 +192,50 @@ def test_learned_options_of_another_recipe_are_refused(recipe, tmp_path):
         load_policy(path)
     write_arrays(path, {name: array for name, array in arrays.items() if "exits" not in name}, header)
     with pytest.raises(BadFile, match="exits is missing"):
+        load_policy(path)
+
+
+def plan_policy() -> PlanPolicy:
+    plan = PlanConfig(horizon=5, patch=3, peak=7.5, background=-3.5, noisy=True)
+    keys = jax.random.split(jax.random.key(0), 2)
+    made = jax.vmap(lambda key: init_plan_network(SMALL, plan, (12, 9, 3), 7, key))(keys)
+    return PlanPolicy("straw", ARM, Rules(step_limit=30), SMALL, made, 0.1, (4, 5))
+
+
+def test_networks_that_plan_come_back(tmp_path):
+    policy = plan_policy()
+    save_policy(tmp_path / "policy.safetensors", policy)
+    found = load_policy(tmp_path / "policy.safetensors")
+    assert isinstance(found, PlanPolicy)
+    for name in ("agent", "environment", "rules", "shape", "reward_scale", "seeds"):
+        assert getattr(found, name) == getattr(policy, name)
+    assert found.networks.shape == policy.networks.shape
+    jax.tree.map(np.testing.assert_array_equal, found.network(1), policy.network(1))
+    one, other = (record(each, 1, jax.random.key(0), "straw") for each in (found, policy))
+    np.testing.assert_array_equal(one.values, other.values)
+    assert one.ahead == other.ahead
+    assert len(one.ahead) == len(one.option) == 30
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"horizon": 0},
+        {"horizon": 10**30},
+        {"horizon": "five"},
+        {"patch": 4},
+        {"peak": "high"},
+        {"peak": None},
+        {"colour": "red"},
+    ],
+)
+def test_hostile_recipes_of_plans_are_refused(wrong, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, plan_policy())
+    arrays, header = read_arrays(path)
+    header["plans"]["plan"] |= wrong
+    write_arrays(path, arrays, header)
+    with pytest.raises(BadFile):
         load_policy(path)
 
 

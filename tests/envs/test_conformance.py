@@ -10,6 +10,7 @@ from lodestone.envs.base import Environment, example_state, sample_initial, samp
 from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
+from lodestone.envs.goal_maze import GoalMaze
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.registry import ENVIRONMENTS
@@ -31,6 +32,7 @@ CASES = {
     "taxi, index": Taxi(fickle=0.3, starts="any", observation="index"),
     "corridor-maze, small": CorridorMaze(2, 3, width=2, length=4, maze_seed=1, observation="cell"),
     "corridor-maze, deterministic": CorridorMaze(1, 2, move_success=1.0, pixels_per_cell=2),
+    "goal-maze, planes": GoalMaze(observation="planes"),
     "random-mdp, index": RandomMDP(mdp_seed=1, states=9, actions=2, goals=3, observation="index"),
     "chain, index": Chain(length=4, start=4, right_success=0.8, observation="index"),
     "two-rooms, cell": TwoRooms(observation="cell"),

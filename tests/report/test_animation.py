@@ -6,7 +6,7 @@ import pytest
 from fake_comparison import make_playback
 from PIL import Image
 
-from lodestone.report.animation import STRIP, write_gif
+from lodestone.report.animation import LINE, STRIP, write_gif
 
 
 def read(path: Path) -> tuple[list[np.ndarray], list[int]]:
@@ -53,3 +53,12 @@ def test_any_name_fits(tmp_path: Path, name: str) -> None:
     )
     write_gif(short, tmp_path / "episode.gif")
     assert len(read(tmp_path / "episode.gif")[0]) == 3
+
+
+def test_a_line_says_what_is_planned(tmp_path: Path) -> None:
+    whole = make_playback()
+    planning = replace(whole, ahead=("up",) * len(whole.option), pictures=whole.pictures[:3], option=whole.option[:2])
+    write_gif(planning, tmp_path / "episode.gif")
+    frames, _ = read(tmp_path / "episode.gif")
+    assert frames[0].shape[0] == whole.pictures.shape[1] + STRIP + LINE
+    assert frames[0][-LINE:].min() < 128  # something is written there

@@ -87,3 +87,12 @@ def test_the_table_has_a_column_of_terminations(monkeypatch: pytest.MonkeyPatch)
     final = rows[-len(OPTIONS) :]
     assert [row[0] for row in final] == list(OPTIONS)
     assert [row[2:] for row in final] == [["1.00"]] * 6 + [[], ["0.03"]]
+
+
+def test_what_is_planned_is_shown(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = make_playback()
+    planning = replace(whole, ahead=tuple(f"up, a new plan ({step})" for step in range(len(whole.option))))
+    printed = lines(planning, capsys)
+    assert len(printed) == 2 * len(whole.option)
+    assert printed[1].split() == ["then", "up,", "a", "new", "plan", "(0)"]
+    assert "then up, a new plan (14)" in screens(planning, monkeypatch)
