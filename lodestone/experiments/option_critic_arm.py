@@ -277,7 +277,7 @@ def _gates(runs: dict[str, Run]) -> list[Gate]:
     return [
         at_least(f"share of seeds that build the tower, {FOUR}", builds(four).mean(), 0.8),
         at_least(f"share of seeds that build the tower, {FLAT}", builds(runs[FLAT]).mean(), 0.8),
-        at_most(f"steps above the optimum, mean of the seeds that build it, {FOUR}", over, 3.0),
+        at_most(f"steps above the optimum, mean of the seeds that build it, {FOUR}", over, 2.0),
         at_most(f"{GREEDY}: by how much a beta has fallen", 0.5 - runs[GREEDY].least_stop, 0.0),
         at_most(f"{GREEDY}: option length", runs[GREEDY].length[-1].mean(), 2.0),
         at_least(f"{COSTLY}: option length", runs[COSTLY].length[-1].mean(), 10.0),

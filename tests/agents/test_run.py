@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 
+from lodestone.agents.deep_option_critic import DeepOptionCriticConfig
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.hdqn import HDQNConfig
@@ -19,6 +20,7 @@ from lodestone.agents.q_learning import QLearningConfig
 from lodestone.agents.run import CONFIG, Run, read_run, save_run
 from lodestone.agents.sarsa import SarsaConfig
 from lodestone.agents.saved import UnitedPolicy
+from lodestone.agents.straw import StrawConfig
 from lodestone.agents.training import AGENTS, train_policy
 from lodestone.agents.united import UnitedConfig
 from lodestone.envs.chain import Chain
@@ -56,12 +58,14 @@ RUNS = {
     "sarsa": run_of(SarsaConfig()),
     "intra-option": run_of(IntraOptionConfig()),
     "option-critic": run_of(OptionCriticConfig()),
+    "deep-option-critic": run_of(DeepOptionCriticConfig(network=FLAT, environments=4)),
+    "straw": run_of(StrawConfig(network=FLAT, environments=4, rollout=8), ARM),
     "maxq": run_of(MAXQConfig(), TwoRooms()),
     "hamq": run_of(HAMQConfig(), ARM),
 }
 
 
-SLOW = ("dqn", "united", "hdqn", "q-learning", "sarsa", "maxq")
+SLOW = ("dqn", "united", "hdqn", "q-learning", "sarsa", "maxq", "deep-option-critic", "straw")
 """Agents that take long to compile, or that are like others. `test_resume.py` has three of them."""
 
 
