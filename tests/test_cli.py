@@ -343,6 +343,7 @@ def test_bad_input_is_refused_in_a_sentence(words, sentence, capsys, tmp_path, m
     assert list(tmp_path.rglob("*")) == []
 
 
+@pytest.mark.slow
 def test_a_united_network_starts_as_another_ended_on_another_grid(capsys, tmp_path):
     shape = ["--observation", "planes", "--kernels", "3", "--strides", "1", "--channels", "8", "--hidden", "16"]
     short = ["--learning-starts", "100", "--steps", "400", "--json"]

@@ -160,7 +160,7 @@ def _chunks(checkpoint: Path) -> int:
     return len(read_arrays(checkpoint)[0]["history/usage/seconds"])
 
 
-@pytest.mark.parametrize(("name", "kills"), [("options", 2), ("united", 1)])
+@pytest.mark.parametrize(("name", "kills"), [("options", 2), pytest.param("united", 1, marks=pytest.mark.slow)])
 def test_networks_survive_being_killed(name, kills, program, whole, tmp_path):
     run, chance = tmp_path / "run", random.Random(1)
     words = train(name, run)

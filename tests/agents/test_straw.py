@@ -271,6 +271,7 @@ def learned(seeds):
     return jax.tree.map(np.asarray, carry.network), chunk, play(carry.network)
 
 
+@pytest.mark.slow
 def test_the_shortest_way_is_learned_and_other_seeds_change_nothing():
     networks, chunk, episodes = learned((3, 4))
     assert episodes.steps.tolist() == [4, 4]

@@ -67,6 +67,7 @@ def tiny() -> magnet_tower.Settings:
     )
 
 
+@pytest.mark.slow
 def test_a_tiny_run_fills_the_folder(tmp_path):
     reproduction = Reproduction(tmp_path, "fast", 2, "2")
     saved = []

@@ -82,6 +82,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer, "STEPS", 6000)
 
 
+@pytest.mark.slow
 def test_a_short_run_judges_everywhere_and_learns_on(monkeypatch):
     monkeypatch.setattr(transfer, "SOURCE", SMALL)
     monkeypatch.setattr(transfer, "TARGET", LARGE)

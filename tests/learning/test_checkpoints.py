@@ -222,6 +222,7 @@ def test_what_cannot_be_written_is_said_after_the_next_chunk(tmp_path, monkeypat
     with Checkpoints(tmp_path, "run", 0.0) as checkpoints:
         checkpoints.after_chunk(make_carry(), make_history(), 2)
         checkpoints.after_chunk(make_carry(), make_history(), 4)
+        checkpoints.wait()
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full)
             checkpoints.after_chunk(make_carry(), make_history(), 6)
@@ -235,6 +236,15 @@ def test_one_is_written_when_it_is_due(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture
+def interruptible():
+    """As of a process in the foreground, wherever the tests run."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_waits_for_a_last_one_and_a_second_does_not(tmp_path):
     with Checkpoints(tmp_path, "run", every=60.0) as checkpoints:
         checkpoints.after_chunk(make_carry(), make_history(), 2)
