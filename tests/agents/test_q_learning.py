@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from corridor import Corridor
+from corridor import LEFT, Corridor, Walk
 
 from lodestone.agents.playing import play
 from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, choose, largest, q_learning
@@ -65,6 +65,25 @@ def test_a_time_limit_bootstraps_unless_it_is_taken_for_an_end():
             found[bootstrap] = float(jnp.max(carry.table))
     assert found[True] == pytest.approx(10.0, abs=1e-2)
     assert found[False] == pytest.approx(1 / (1 - 0.81), abs=0.2)
+
+
+class OnlyLeftPays(Still):
+    """The same, where going left pays 1 and going right nothing."""
+
+    def reward(self, state, action, next_state):
+        return (action == LEFT).astype(jnp.float32)
+
+
+def test_an_option_that_a_limit_cuts_bootstraps_from_itself_alone():
+    """Going right for ever is worth nothing, though left, which pays 10, could begin wherever the limit cuts it."""
+    world = OnlyLeftPays(length=2)
+    options = Union((Primitives(world.action_names), Walk(stop=9)))
+    rules = Rules(discount=0.9, step_limit=3)
+    config = QLearningConfig(learning_rate=((0.0, 0.5), (0.3, 0.01)), epsilon=((0.0, 0.5),))
+    for carry, _ in train(q_learning(config, world, options, rules, 20_000), [0], 20_000 // STEPS_PER_ROUND, 20_000):
+        left, _, walk = carry.table[0, 0]
+    assert left == pytest.approx(10.0, abs=0.05)
+    assert walk == 0.0
 
 
 def test_options_of_one_step_are_q_learning():
