@@ -46,34 +46,49 @@ class QLearningConfig:
         check_knots("epsilon", self.epsilon, 0.0, 1.0)
 
 
-class Carry(NamedTuple):
-    """Everything that one seed carries from round to round."""
+class Learned(NamedTuple):
+    """What is learned."""
 
     table: Float[Array, "S O"]
     """Q; starts at zero as in the paper, which is optimistic where steps cost. Minus infinity where an option may not
     start, so that no maximum has to look that up."""
+    best: Float[Array, " S"]
+    """The maximum of each row, kept beside it: an update changes one row and asks for the maximum of another."""
+
+
+class Carry(NamedTuple):
+    """Everything that one seed carries from round to round."""
+
+    learned: Learned
     actor: Actor
     key: PRNGKeyArray
 
+    @property
+    def table(self) -> Float[Array, "S O"]:
+        """Q."""
+        return self.learned.table
+
 
 def update(
-    table: Float[Array, "S O"], decision: Decision, learning_rate: Float[Array, ""], may_cut: bool
-) -> tuple[Float[Array, "S O"], Float[Array, ""]]:
+    learned: Learned, values: Float[Array, " O"], decision: Decision, learning_rate: Float[Array, ""], may_cut: bool
+) -> tuple[Learned, Float[Array, ""]]:
     """One update from one decision between numbered states; none where the decision is not valid. Returns the squared
     error, too.
 
-    `may_cut`: whether a limit may cut an option, which alone is then available in the next state; elsewhere the table
-    says what is available.
+    `values` is the row of the state where the option began. `may_cut`: whether a limit may cut an option, which alone
+    is then available in the next state; elsewhere the table says what is available.
     """
-    transition = decision.transition
-    next_values = table[transition.next_obs]
+    transition, (table, best) = decision.transition, learned
+    option, next_value = transition.action, best[transition.next_obs]
     if may_cut:
-        next_values = mask_unavailable(next_values, transition.next_available)
-    target = transition.reward + jnp.where(transition.discount > 0, transition.discount * largest(next_values), 0.0)
+        next_value = largest(mask_unavailable(table[transition.next_obs], transition.next_available))
+    target = transition.reward + jnp.where(transition.discount > 0, transition.discount * next_value, 0.0)
+    error = jnp.where(decision.valid, target - values[option], 0.0)
+    value = values[option] + learning_rate * error
+    best = best.at[transition.obs].set(largest(jnp.where(jnp.arange(values.size) == option, value, values)))
     # One index rather than two: the compiler would first put them together in memory.
-    values, pair = table.ravel(), transition.obs * table.shape[1] + transition.action
-    error = jnp.where(decision.valid, target - values[pair], 0.0)
-    return values.at[pair].add(learning_rate * error).reshape(table.shape), jnp.square(error)
+    table = table.ravel().at[transition.obs * values.size + option].set(value).reshape(table.shape)
+    return Learned(table, best), jnp.square(error)
 
 
 def largest(row: Float[Array, " O"]) -> Float[Array, ""]:
@@ -98,6 +113,13 @@ def choose_among(
     least = jnp.where(explores < epsilon, jnp.finfo(jnp.float32).min, _largest(values))
     counts = list(accumulate(jnp.where(value >= least, 1.0, 0.0) for value in values))
     return sum((count <= picks * counts[-1]).astype(jnp.int32) for count in counts[:-1]) + jnp.int32(0)
+
+
+def one_for_two(uniform: Float[Array, ""], epsilon: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """A number to compare with epsilon and one to pick with, both uniform in [0, 1), out of one such number: on either
+    side of epsilon it is uniform again."""
+    explores = uniform < epsilon
+    return uniform, jnp.where(explores, uniform, uniform - epsilon) / jnp.where(explores, epsilon, 1.0 - epsilon)
 
 
 def _largest(values: list[Float[Array, ""]]) -> Float[Array, ""]:
@@ -143,8 +165,8 @@ def q_learning_on_numbers(
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        table = jnp.where(options.initiation_table, 0.0, -jnp.inf)
-        return Carry(table, start_actor(world, actor_key), key)
+        learned = Learned(jnp.where(options.initiation_table, 0.0, -jnp.inf), jnp.zeros(world.ends.size))
+        return Carry(learned, start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`STEPS_PER_ROUND` primitive steps, each with an update if a decision ends on it."""
@@ -153,17 +175,19 @@ def q_learning_on_numbers(
         learning_rate = piecewise_linear(config.learning_rate, fraction)
         noise_key, key = jax.random.split(carry.key)
 
-        def step(carry: tuple[Array, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Array, Actor], tuple]:
-            table, actor = carry
-            values = table[actor.state]
-            choice = choose(noise[:2], values, values > -jnp.inf, epsilon)
-            actor, decision = tick(world, options, rules, deal(noise[2:], needed), actor, choice)
-            table, loss = update(table, decision, learning_rate, may_cut=rules.step_limit is not None)
-            return (table, actor), (decision, loss)
+        def step(carry: tuple[Learned, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Learned, Actor], tuple]:
+            learned, actor = carry
+            # The row serves the choice, if there is one to make, and the update, if the option ends on this step.
+            values = learned.table[jnp.where(actor.deciding, actor.state, actor.start)]
+            uniform = jnp.stack(one_for_two(noise[0], epsilon))
+            choice = choose(uniform, values, values > -jnp.inf, epsilon)
+            actor, decision = tick(world, options, rules, deal(noise[1:], needed), actor, choice)
+            learned, loss = update(learned, values, decision, learning_rate, may_cut=rules.step_limit is not None)
+            return (learned, actor), (decision, loss)
 
         # Random numbers are drawn for all steps together: one by one they would take longer than the steps.
-        noise = uniforms(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))
-        (table, actor), (decisions, losses) = jax.lax.scan(step, (carry.table, carry.actor), noise)
-        return Carry(table, actor, key), log_round(decisions, jnp.mean(losses))
+        noise = uniforms(noise_key, (STEPS_PER_ROUND, 1 + sum(needed)))
+        (learned, actor), (decisions, losses) = jax.lax.scan(step, (carry.learned, carry.actor), noise)
+        return Carry(learned, actor, key), log_round(decisions, jnp.mean(losses))
 
     return Algorithm(init, run_round)

@@ -9,8 +9,9 @@ import pytest
 from corridor import LEFT, Corridor, Walk
 
 from lodestone.agents.playing import play
-from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, choose, largest, q_learning
+from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, choose, largest, one_for_two, q_learning
 from lodestone.agents.training import train_policy
+from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.learning.loop import train
 from lodestone.learning.policies import epsilon_greedy
@@ -18,6 +19,7 @@ from lodestone.learning.schedules import Knots
 from lodestone.options.base import Capped, Primitives, Union
 from lodestone.options.catalogue import scripted_options
 from lodestone.options.execution import Rules
+from lodestone.options.four_rooms import hallway_options
 from lodestone.planning.option_models import option_value_iteration, tabulate_options
 from lodestone.planning.tables import tabulate
 
@@ -112,6 +114,33 @@ def test_choices_entry_by_entry_are_epsilon_greedy(size, epsilon):
     found, wanted = (draw(uniform, values, available, jnp.float32(epsilon)) for draw in draws)
     np.testing.assert_array_equal(found, wanted)
     np.testing.assert_array_equal(jax.vmap(largest)(values), values.max(axis=1))
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 1e-3, 0.3, 1.0])
+def test_one_number_serves_for_exploring_and_for_picking(epsilon):
+    """On either side of epsilon the pick is uniform in [0, 1), up to the spacing of the numbers there."""
+    uniform = jnp.arange(0, 1, 2.0**-20, dtype=jnp.float32).at[-1].set(1 - 2.0**-23)
+    explores, picks = one_for_two(uniform, jnp.float32(epsilon))
+    explores = explores < epsilon
+    assert float(jnp.mean(explores)) == pytest.approx(epsilon, abs=1e-6)
+    for side in (explores, ~explores):
+        if side.any():
+            on_side = np.sort(picks[side])
+            assert on_side[0] >= 0
+            assert on_side[-1] < 1
+            np.testing.assert_allclose(on_side, np.arange(len(on_side)) / len(on_side), atol=2 / len(on_side))
+
+
+@pytest.mark.parametrize("step_limit", [None, 7])
+def test_the_maximum_beside_each_row_is_that_of_the_row(step_limit):
+    rooms = FourRooms()
+    options = Union((Primitives(rooms.action_names), hallway_options(rooms)))
+    algorithm = q_learning(QLearningConfig(), rooms, options, Rules(step_limit=step_limit), 3200)
+    for carry, _ in train(algorithm, [0, 1], 100, 100):
+        table, best = np.asarray(carry.table), np.asarray(carry.learned.best)
+    assert (best != 0).mean() > 0.5
+    startable = np.isfinite(table).any(axis=2)
+    np.testing.assert_array_equal(best[startable], table.max(axis=2)[startable])
 
 
 EXPLORING: Knots = ((0.0, 1.0), (1.0, 0.3))
