@@ -24,11 +24,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND, choose, largest, needed_chance
+from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
 from lodestone.envs.base import Environment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
-from lodestone.learning.policies import mask_unavailable
+from lodestone.learning.policies import choose, largest, mask_unavailable
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms

@@ -27,10 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import choose_among
 from lodestone.envs.base import Environment, initial_state, sample_initial
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
+from lodestone.learning.policies import choose_among, one_for_two
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.execution import Rules, uniforms
 from lodestone.planning.enumerated import enumerated, look_up_step
@@ -135,7 +135,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     world, num_actions, num_edges = enumerated(tables, environment.action_names), tasks.num_actions, len(tasks.edges)
     places = arrange(tasks, may_be_running(tasks, tables))
     evaluate, top = evaluator(tasks, places), len(places.calls) - 1
-    draws = 1 + 2 * sum(edges.shape[1] > 1 for edges in places.calls)
+    draws = 1 + sum(edges.shape[1] > 1 for edges in places.calls)
 
     # What a state and another number look up is flat: one index is put together far faster than two.
     completion_slot = jnp.asarray(tasks.completion_slot.T.ravel())
@@ -197,7 +197,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         for place in reversed(range(top + 1)):
             here, values, choice = caller == place, known[place].inner_calls, jnp.int32(0)
             if len(values) > 1:
-                choice = choose_among(next(uniform), next(uniform), values, epsilon)
+                choice = choose_among(*one_for_two(next(uniform), epsilon), values, epsilon)
             call = calls[place][carry.state * len(values) + choice]
             edge[place] = jnp.where(here, call, edge[place])
             called_at[place] = jnp.where(here, carry.steps, called_at[place])

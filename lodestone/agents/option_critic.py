@@ -24,11 +24,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND, choose, largest
+from lodestone.agents.q_learning import STEPS_PER_ROUND
 from lodestone.envs.base import Environment, Step, inverse_cdf
 from lodestone.envs.state_space import Numbers
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
+from lodestone.learning.policies import choose, largest
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.soft import SoftOptions

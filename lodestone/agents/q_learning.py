@@ -8,18 +8,16 @@ once per option execution. With the primitive actions as the only options it is 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
-from itertools import accumulate
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import UNROLLED, Environment
+from lodestone.envs.base import Environment
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
-from lodestone.learning.policies import epsilon_greedy, mask_unavailable
+from lodestone.learning.policies import choose, largest, mask_unavailable, one_for_two
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Chance, Decision, Rules, deal, start_actor, tick, uniforms
@@ -89,41 +87,6 @@ def update(
     # One index rather than two: the compiler would first put them together in memory.
     table = table.ravel().at[transition.obs * values.size + option].set(value).reshape(table.shape)
     return Learned(table, best), jnp.square(error)
-
-
-def largest(row: Float[Array, " O"]) -> Float[Array, ""]:
-    """The maximum of a row. A short one is gone through entry by entry: where many seeds learn side by side that is one
-    loop over them, and a reduction is several."""
-    return _largest(list(row)) if row.size <= UNROLLED else jnp.max(row)
-
-
-def choose(
-    uniform: Float[Array, " 2"], values: Float[Array, " O"], available: Bool[Array, " O"], epsilon: Float[Array, ""]
-) -> Int[Array, ""]:
-    """What `epsilon_greedy` chooses, entry by entry as in `largest`."""
-    if values.size > UNROLLED:
-        return epsilon_greedy(uniform, values, available, epsilon)
-    return choose_among(uniform[0], uniform[1], list(mask_unavailable(values, available)), epsilon)
-
-
-def choose_among(
-    explores: Float[Array, ""], picks: Float[Array, ""], values: list[Float[Array, ""]], epsilon: Float[Array, ""]
-) -> Int[Array, ""]:
-    """The same for a few values that are no array; -inf where there is nothing to choose."""
-    least = jnp.where(explores < epsilon, jnp.finfo(jnp.float32).min, _largest(values))
-    counts = list(accumulate(jnp.where(value >= least, 1.0, 0.0) for value in values))
-    return sum((count <= picks * counts[-1]).astype(jnp.int32) for count in counts[:-1]) + jnp.int32(0)
-
-
-def one_for_two(uniform: Float[Array, ""], epsilon: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """A number to compare with epsilon and one to pick with, both uniform in [0, 1), out of one such number: on either
-    side of epsilon it is uniform again."""
-    explores = uniform < epsilon
-    return uniform, jnp.where(explores, uniform, uniform - epsilon) / jnp.where(explores, epsilon, 1.0 - epsilon)
-
-
-def _largest(values: list[Float[Array, ""]]) -> Float[Array, ""]:
-    return reduce(lambda one, other: jnp.where(one > other, one, other), values)
 
 
 def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...]:

@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND, choose, needed_chance
+from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
 from lodestone.envs.base import Environment
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
+from lodestone.learning.policies import choose
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms

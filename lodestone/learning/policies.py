@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from itertools import accumulate
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from lodestone.envs.base import inverse_cdf
+from lodestone.envs.base import UNROLLED, inverse_cdf
 
 
 def mask_unavailable(values: Float[Array, " O"], available: Bool[Array, " O"]) -> Float[Array, " O"]:
@@ -28,3 +31,38 @@ def epsilon_greedy(
     masked = mask_unavailable(values, available)
     candidates = available & ((uniform[0] < epsilon) | (masked == jnp.max(masked)))
     return inverse_cdf(candidates.astype(jnp.float32), uniform[1])
+
+
+def largest(row: Float[Array, " O"]) -> Float[Array, ""]:
+    """The maximum of a row. A short one is gone through entry by entry: where many seeds learn side by side that is one
+    loop over them, and a reduction is several."""
+    return _largest(list(row)) if row.size <= UNROLLED else jnp.max(row)
+
+
+def choose(
+    uniform: Float[Array, " 2"], values: Float[Array, " O"], available: Bool[Array, " O"], epsilon: Float[Array, ""]
+) -> Int[Array, ""]:
+    """What `epsilon_greedy` chooses, entry by entry as in `largest`."""
+    if values.size > UNROLLED:
+        return epsilon_greedy(uniform, values, available, epsilon)
+    return choose_among(uniform[0], uniform[1], list(mask_unavailable(values, available)), epsilon)
+
+
+def choose_among(
+    explores: Float[Array, ""], picks: Float[Array, ""], values: list[Float[Array, ""]], epsilon: Float[Array, ""]
+) -> Int[Array, ""]:
+    """The same for a few values that are no array; -inf where there is nothing to choose."""
+    least = jnp.where(explores < epsilon, jnp.finfo(jnp.float32).min, _largest(values))
+    counts = list(accumulate(jnp.where(value >= least, 1.0, 0.0) for value in values))
+    return sum((count <= picks * counts[-1]).astype(jnp.int32) for count in counts[:-1]) + jnp.int32(0)
+
+
+def one_for_two(uniform: Float[Array, ""], epsilon: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """A number to compare with epsilon and one to pick with, both uniform in [0, 1), out of one such number: on either
+    side of epsilon it is uniform again."""
+    explores = uniform < epsilon
+    return uniform, jnp.where(explores, uniform, uniform - epsilon) / jnp.where(explores, epsilon, 1.0 - epsilon)
+
+
+def _largest(values: list[Float[Array, ""]]) -> Float[Array, ""]:
+    return reduce(lambda one, other: jnp.where(one > other, one, other), values)

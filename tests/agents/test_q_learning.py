@@ -9,12 +9,11 @@ import pytest
 from corridor import LEFT, Corridor, Walk
 
 from lodestone.agents.playing import play
-from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, choose, largest, one_for_two, q_learning
+from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
 from lodestone.agents.training import train_policy
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.learning.loop import train
-from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.schedules import Knots
 from lodestone.options.base import Capped, Primitives, Union
 from lodestone.options.catalogue import scripted_options
@@ -100,35 +99,6 @@ def test_options_of_one_step_are_q_learning():
             tables.append(np.asarray(carry.table))
     np.testing.assert_array_equal(*tables)
     assert tables[0].any()
-
-
-@pytest.mark.parametrize("size", [1, 5, 12, 40])
-@pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
-def test_choices_entry_by_entry_are_epsilon_greedy(size, epsilon):
-    """With ties, and with options that may not start."""
-    rng = np.random.default_rng(size)
-    values = jnp.asarray(rng.integers(-2, 3, size=(400, size)), dtype=jnp.float32)
-    available = jnp.asarray(rng.random((400, size)) < 0.6).at[:, rng.integers(size)].set(True)
-    uniform = jnp.asarray(rng.random((400, 2)), dtype=jnp.float32)
-    draws = (jax.vmap(one, in_axes=(0, 0, 0, None)) for one in (choose, epsilon_greedy))
-    found, wanted = (draw(uniform, values, available, jnp.float32(epsilon)) for draw in draws)
-    np.testing.assert_array_equal(found, wanted)
-    np.testing.assert_array_equal(jax.vmap(largest)(values), values.max(axis=1))
-
-
-@pytest.mark.parametrize("epsilon", [0.0, 1e-3, 0.3, 1.0])
-def test_one_number_serves_for_exploring_and_for_picking(epsilon):
-    """On either side of epsilon the pick is uniform in [0, 1), up to the spacing of the numbers there."""
-    uniform = jnp.arange(0, 1, 2.0**-20, dtype=jnp.float32).at[-1].set(1 - 2.0**-23)
-    explores, picks = one_for_two(uniform, jnp.float32(epsilon))
-    explores = explores < epsilon
-    assert float(jnp.mean(explores)) == pytest.approx(epsilon, abs=1e-6)
-    for side in (explores, ~explores):
-        if side.any():
-            on_side = np.sort(picks[side])
-            assert on_side[0] >= 0
-            assert on_side[-1] < 1
-            np.testing.assert_allclose(on_side, np.arange(len(on_side)) / len(on_side), atol=2 / len(on_side))
 
 
 @pytest.mark.parametrize("step_limit", [None, 7])
