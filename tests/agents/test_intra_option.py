@@ -33,15 +33,18 @@ def learn(config: IntraOptionConfig, environment: Environment, options: Options,
     return np.asarray(carry.table)[:seeds], calls
 
 
+def primitives_and_others(drawing: bool) -> Union:
+    """Random options beside the primitives; where they do not draw their actions, they take the first likeliest."""
+    mixed = random_options(seed=5)
+    first_action = jax.nn.one_hot(jnp.argmax(mixed.acts, axis=2), NUM_ACTIONS)
+    temporal = mixed if drawing else RandomOptions(mixed.start, first_action, mixed.stops, mixed.caps)
+    return Union((Primitives(tuple(f"primitive-{action}" for action in range(NUM_ACTIONS))), temporal))
+
+
 @pytest.mark.parametrize(("behaviour", "drawing"), [("primitives", False), ("primitives", True), ("options", True)])
 def test_learned_values_are_the_planners_also_of_options_that_never_ran(behaviour, drawing) -> None:
     """Oracle T2, the noise of single runs averaged out; options draw their actions in some states, or in none."""
-    mdp = random_mdp(seed=1, goals=1)
-    mixed = random_options(seed=5)
-    first_action = jax.nn.one_hot(jnp.argmax(mixed.acts, axis=2), NUM_ACTIONS)
-    names = tuple(f"primitive-{action}" for action in range(NUM_ACTIONS))
-    temporal = mixed if drawing else RandomOptions(mixed.start, first_action, mixed.stops, mixed.caps)
-    options = Union((Primitives(names), temporal))
+    mdp, options = random_mdp(seed=1, goals=1), primitives_and_others(drawing)
     config = IntraOptionConfig(learning_rate=SETTLING, epsilon=((0.0, 1.0),), behaviour=behaviour)
     learned, calls = learn(config, mdp, options, Rules(discount=0.9, step_limit=50), 100_000, seeds=32)
     tables = tabulate(mdp)
@@ -56,6 +59,22 @@ def test_learned_values_are_the_planners_also_of_options_that_never_ran(behaviou
     assert np.abs(learned.mean(axis=0) - going_on)[live].max() < 0.05
     assert (calls[NUM_ACTIONS:] == 0).all() == (behaviour == "primitives")
     assert (calls[:NUM_ACTIONS] > 0).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drawing", [False, True])
+def test_single_runs_learn_options_that_they_never_take(drawing):
+    """Oracle T2 for each of 5 seeds: 24 million steps, behaving by the primitives alone."""
+    mdp, options = random_mdp(seed=1, goals=1), primitives_and_others(drawing)
+    learning_rate = ((0.0, 0.5), (0.01, 0.1), (0.05, 0.02), (0.2, 0.004), (1.0, 0.0001))
+    config = IntraOptionConfig(learning_rate, epsilon=((0.0, 1.0),), behaviour="primitives")
+    learned, calls = learn(config, mdp, options, Rules(discount=0.9, step_limit=50), 24_000_000, seeds=5)
+    tables = tabulate(mdp)
+    tabulated = tabulate_options(options, tables.space)
+    exact = option_value_iteration(tables, tabulated, 0.9).option_values
+    available = tabulated.initiation.T & ~tables.terminal[:, None]
+    assert np.abs(learned - exact)[:, available].max() < 0.05
+    assert (calls[NUM_ACTIONS:] == 0).all()
 
 
 def test_a_step_updates_the_options_that_would_have_taken_it_and_no_other() -> None:
