@@ -28,7 +28,7 @@ from lodestone.learning.policies import epsilon_greedy
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import semi_markov_target
 from lodestone.machines.machine import Hierarchy
-from lodestone.options.execution import Rules
+from lodestone.options.execution import REWARD_SWITCHES, Rules
 from lodestone.planning.joint import JointProcess, joint_process
 
 TICKS_PER_ROUND = 32
@@ -131,8 +131,7 @@ def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rul
     Raises what `joint_process` raises, `InvalidConfig` for rules about options, and for machines without a choice.
     """
     process = joint_process(environment, hierarchy)
-    if rules.call_cost or rules.undiscounted_option_reward:
-        raise InvalidConfig("HAMQ has no options: neither a call cost nor an undiscounted option reward.")
+    rules.refuse(REWARD_SWITCHES, "HAMQ has no options")
     if process.num_choices == 0:
         raise InvalidConfig("The machines leave no choice open, so there is nothing to learn.")
     arrays = on_device(process)

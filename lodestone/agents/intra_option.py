@@ -31,7 +31,7 @@ from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose, largest, mask_unavailable
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
-from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms
+from lodestone.options.execution import REWARD_SWITCHES, Actor, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.tabular import on_numbers
 from lodestone.planning.enumerated import enumerated, look_up_step
 from lodestone.planning.interruption import refuse_caps
@@ -117,12 +117,8 @@ def intra_option_q_learning(
     discounted sum of its steps' rewards; `NoOptionAvailable` where the behaviour has nothing to choose from.
     """
     refuse_caps(options.names, options.max_steps, "learned from single steps")
-    for switch, off in (("undiscounted_option_reward", False), ("call_cost", 0.0)):
-        if getattr(rules, switch) != off:
-            raise InvalidConfig(
-                f"{switch} is {getattr(rules, switch)}, but learning within options takes the reward of an option to "
-                "be the discounted sum of its steps' rewards."
-            )
+    why = "learning within options takes the reward of an option to be the discounted sum of its steps' rewards"
+    rules.refuse(REWARD_SWITCHES, why)
     tables = tabulate(environment)
     world = enumerated(tables, environment.action_names)
     numbered = on_numbers(options, tables.space)

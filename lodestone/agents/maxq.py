@@ -32,7 +32,7 @@ from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
 from lodestone.learning.policies import choose_among, one_for_two
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import Rules, uniforms
+from lodestone.options.execution import REWARD_SWITCHES, Rules, uniforms
 from lodestone.planning.enumerated import enumerated, look_up_step
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.places import arrange, may_be_running
@@ -124,8 +124,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     only the last action is learned from. Raises `TooManyStates`, `InvalidTaskGraph`, and `InvalidConfig` for rules
     without a limit or that are about options.
     """
-    if rules.call_cost or rules.undiscounted_option_reward or not rules.bootstrap_at_limit:
-        raise InvalidConfig("MAXQ has no call cost, no undiscounted option reward, and takes no limit for an end.")
+    rules.refuse((*REWARD_SWITCHES, "bootstrap_at_limit"), "MAXQ has no options, and takes no limit for an end")
     limits = [limit for limit in (rules.step_limit, rules.decision_limit) if limit is not None]
     if not limits:
         raise InvalidConfig("MAXQ remembers the states of an episode, so it needs a step limit.")

@@ -31,7 +31,7 @@ from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose, largest
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms
+from lodestone.options.execution import REWARD_SWITCHES, Actor, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.soft import SoftOptions
 from lodestone.planning.enumerated import Enumerated, enumerated, look_up_step
 from lodestone.planning.tables import tabulate
@@ -170,12 +170,8 @@ def improve_termination(
 
 def refuse_rules(rules: Rules) -> None:
     """Raise `InvalidConfig` for rules that option-critic does not learn under."""
-    for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
-        if getattr(rules, switch) != wanted:
-            raise InvalidConfig(
-                f"{switch} is {getattr(rules, switch)}, but option-critic takes each step's reward as it comes and a "
-                "limit for no end."
-            )
+    why = "option-critic takes each step's reward as it comes and a limit for no end"
+    rules.refuse((*REWARD_SWITCHES, "bootstrap_at_limit"), why)
 
 
 def option_critic(config: OptionCriticConfig, environment: Environment, rules: Rules, steps: int) -> Algorithm:

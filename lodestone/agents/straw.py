@@ -35,7 +35,7 @@ from lodestone.learning.plan_network import Plan, PlanConfig, PlanNetwork, init_
 from lodestone.learning.plans import shift
 from lodestone.learning.returns import lambda_returns
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import Chance, Decision, Rules
+from lodestone.options.execution import REWARD_SWITCHES, Chance, Decision, Rules
 from lodestone.types import Observation
 
 
@@ -246,12 +246,8 @@ def straw(config: StrawConfig, environment: Environment, rules: Rules, steps: in
     """
     if isinstance(environment, OutsideEnvironment):
         raise InvalidConfig("STRAW plans steps ahead of what may be done there: it takes no Gymnasium environment.")
-    for switch, wanted in (("undiscounted_option_reward", False), ("call_cost", 0.0), ("bootstrap_at_limit", True)):
-        if getattr(rules, switch) != wanted:
-            raise InvalidConfig(
-                f"{switch} is {getattr(rules, switch)}, but STRAW takes each step's reward as it comes and a limit for "
-                "no end."
-            )
+    why = "STRAW takes each step's reward as it comes and a limit for no end"
+    rules.refuse((*REWARD_SWITCHES, "bootstrap_at_limit"), why)
     rounds = config.rounds(steps)
 
     def init(key: PRNGKeyArray) -> Carry:

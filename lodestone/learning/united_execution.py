@@ -133,7 +133,7 @@ def tick(
             obs=actor.start,
             action=actor.option,
             reward=actor.reward,
-            discount=jnp.where(no_future, 0.0, actor.discount),
+            discount=jnp.where(no_future, 0.0, rules.discount if rules.discount_per_decision else actor.discount),
             next_obs=actor.state,
             next_available=jnp.where(cut, jnp.arange(everything.size) == actor.option, everything),
         ),

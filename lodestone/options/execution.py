@@ -8,7 +8,8 @@ options. Written for one environment; the training loop vmaps.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import jax
@@ -46,6 +47,9 @@ class Rules:
     undiscounted_option_reward: bool = False
     """Whether an option's reward is the plain sum of its steps' rewards (the paper's "accumulated reward"): for
     reproduction only, as the values then depend on the options."""
+    discount_per_decision: bool = False
+    """Whether what follows an option is discounted by gamma once, however long it ran (Kulkarni et al. 2016): for
+    reproduction only, for the same reason."""
     call_cost: float = 0.0
     """Taken from the reward of every option that may run longer than one step, once a call."""
 
@@ -56,6 +60,17 @@ class Rules:
             limit = getattr(self, name)
             if limit is not None and limit < 1:
                 raise InvalidConfig(f"{name} is {limit}, but must be at least 1.")
+
+    def refuse(self, switches: Sequence[str], why: str) -> None:
+        """Raise `InvalidConfig` if one of these is not as it is by default."""
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in switches and value != field.default:
+                raise InvalidConfig(f"{field.name} is {value}, but {why}.")
+
+
+REWARD_SWITCHES = ("undiscounted_option_reward", "discount_per_decision", "call_cost")
+"""What makes an option's value something else than the discounted sum of its steps' rewards and of what follows."""
 
 
 class Actor(NamedTuple):
@@ -219,7 +234,7 @@ def tick(
             obs=start,
             action=option,
             reward=option_reward,
-            discount=jnp.where(no_future, 0.0, discount),
+            discount=jnp.where(no_future, 0.0, rules.discount if rules.discount_per_decision else discount),
             next_obs=remembered(environment, state),
             next_available=available,
         ),

@@ -233,8 +233,9 @@ def run(config, rules, rounds, goals=GOALS, environment=CHAIN, seeds=(0,)):
         (Rules(discount=GAMMA, step_limit=9), True),
         (Rules(discount=GAMMA, decision_limit=3), False),
         (Rules(discount=GAMMA, undiscounted_option_reward=True, step_limit=9, bootstrap_at_limit=False), False),
+        (Rules(discount=GAMMA, undiscounted_option_reward=True, discount_per_decision=True, step_limit=9), True),
     ],
-    ids=["step limit", "decision limit, no repeat", "the paper's sum, no repeat"],
+    ids=["step limit", "decision limit, no repeat", "a plain sum, no repeat", "the paper's sum and discount"],
 )
 def test_both_replays_hold_what_a_plain_interpreter_says(rules, repeat):
     """The controller's replay is read as one story per environment; out of it comes the meta-controller's."""
@@ -289,7 +290,8 @@ def test_both_replays_hold_what_a_plain_interpreter_says(rules, repeat):
                 may = [number == chosen for number in range(5)]
             elif not repeat:
                 may[chosen] = False
-            kept = 0.0 if over or (limit and not rules.bootstrap_at_limit) else weight
+            onward = GAMMA if rules.discount_per_decision else weight
+            kept = 0.0 if over or (limit and not rules.bootstrap_at_limit) else onward
             told.append((tick, lane, (start, chosen, total, kept, (position, visited), may)))
             start, given_up, before = None, chosen, chosen
             if over or limit:

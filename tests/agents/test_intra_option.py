@@ -119,7 +119,7 @@ def test_what_cannot_be_learned_from_single_steps_is_refused() -> None:
     with pytest.raises(InvalidConfig, match=r"'walk' is stopped after 7 steps.* cannot be learned from single steps"):
         intra_option_q_learning(config, corridor, Union((primitives, Capped(walk, 7))), Rules(), 100)
     intra_option_q_learning(config, corridor, Union((primitives, Capped(walk, 1))), Rules(), 100)
-    for rules in (Rules(undiscounted_option_reward=True), Rules(call_cost=0.5)):
+    for rules in (Rules(undiscounted_option_reward=True), Rules(call_cost=0.5), Rules(discount_per_decision=True)):
         with pytest.raises(InvalidConfig, match="within options takes the reward"):
             intra_option_q_learning(config, corridor, primitives, rules, 100)
     with pytest.raises(NoOptionAvailable):

@@ -108,6 +108,7 @@ def test_call_and_return_in_all_states_of_4x3(exact):
         Rules(discount=0.9, step_limit=7),
         Rules(discount=0.9, decision_limit=3),
         Rules(discount=0.9, step_limit=7, bootstrap_at_limit=False, undiscounted_option_reward=True, call_cost=0.5),
+        Rules(discount=0.9, discount_per_decision=True),
     ],
 )
 def test_the_same_decisions_as_the_executor_of_options(rules):

@@ -53,6 +53,15 @@ def test_undiscounted_sum_and_call_cost_are_switches():
     assert float(decisions[3].transition.reward) == pytest.approx(2.0)  # a primitive pays no call
 
 
+def test_one_discount_a_decision_is_a_switch():
+    rules = Rules(discount=GAMMA, discount_per_decision=True)
+    decisions = play(Corridor(length=6), Walk(stop=3), rules, [WALK, WALK, WALK, LEFT])
+    assert float(decisions[2].transition.reward) == pytest.approx(1 + 2 * GAMMA + 3 * GAMMA**2)
+    assert float(decisions[2].transition.discount) == pytest.approx(GAMMA)
+    end = play(Corridor(length=3), Walk(stop=99), rules, [WALK, WALK])[-1]
+    assert float(end.transition.discount) == 0.0
+
+
 def test_an_option_runs_at_least_one_step():
     # The walk would stop in cell 0, where it is chosen: termination is only asked on arrival.
     decisions = play(Corridor(length=6), Walk(stop=0), Rules(), [WALK, WALK])
