@@ -40,7 +40,7 @@ from lodestone.envs.host import FromFunction, Registered
 from lodestone.envs.magnet_arm import MagnetArm, go_down_task, lift_task
 from lodestone.envs.option_env import HostOption, OptionEnv
 from lodestone.envs.random_mdp import RandomMDP
-from lodestone.envs.task import Task, goal
+from lodestone.envs.task import Task, goal, looks
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import LodestoneError
@@ -123,6 +123,7 @@ __all__ = [
     "lift_task",
     "load_options",
     "load_policy",
+    "looks",
     "named_options",
     "optimum",
     "play",

@@ -75,8 +75,30 @@ class Arrival:
         return self.holds(environment, next_state).astype(jnp.float32)
 
 
+@dataclass(frozen=True)
+class Looks:
+    """Whether a state looks like this: its observation is the given one, number for number."""
+
+    values: bytes
+    shape: tuple[int, ...]
+    dtype: str
+
+    def __call__(self, environment: Environment, state: State) -> Bool[Array, ""]:
+        wanted = np.frombuffer(self.values, self.dtype).reshape(self.shape)
+        return jnp.all(environment.observe(state) == wanted)
+
+
+def looks(observation: Observation) -> Looks:
+    """A goal that is given by what is seen there, for `goal`."""
+    seen = np.asarray(observation)
+    return Looks(seen.tobytes(), seen.shape, seen.dtype.str)
+
+
 def goal(environment: Environment, name: str, holds: Callable[..., Bool[Array, ""]]) -> Task:
-    """The task of getting where `holds`: it begins as the environment does and pays 1 on arrival."""
+    """The task of getting where `holds`: it begins as the environment does and pays 1 on arrival.
+
+    `holds(environment, state)` is a function at the top of a module, or `looks(observation)`.
+    """
     return Task(environment, name, _as_before, holds, Arrival(holds))
 
 

@@ -106,7 +106,7 @@ def test_an_episode_pays_what_its_steps_pay():
 def test_rules_without_a_limit_are_refused():
     with pytest.raises(InvalidConfig, match="step limit"):
         maxq(MAXQConfig(), TwoRooms(), task_graph(TwoRooms()), Rules(), 100)
-    with pytest.raises(InvalidConfig, match="call_cost is 1.0, but MAXQ has no options"):
+    with pytest.raises(InvalidConfig, match=r"call_cost is 1\.0, but MAXQ has no options"):
         maxq(MAXQConfig(), TwoRooms(), task_graph(TwoRooms()), Rules(step_limit=10, call_cost=1.0), 100)
 
 
