@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
-from lodestone.agents.saved import (
+from lodestone.agents.policies import (
     AnyPolicy,
     GoalPolicy,
     MachinePolicy,

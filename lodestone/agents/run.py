@@ -16,15 +16,8 @@ import jax
 import numpy as np
 
 from lodestone import __version__
-from lodestone.agents.saved import (
-    AnyPolicy,
-    UnitedPolicy,
-    load_options,
-    load_policy,
-    refuse_bad,
-    save_options,
-    save_policy,
-)
+from lodestone.agents.policies import AnyPolicy, UnitedPolicy
+from lodestone.agents.saved import load_options, load_policy, refuse_bad, save_options, save_policy
 from lodestone.agents.training import AGENTS, AgentConfig
 from lodestone.envs.base import Environment
 from lodestone.envs.host import Registered

@@ -15,8 +15,9 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
+from lodestone.agents.policies import AnyPolicy
 from lodestone.agents.run import CONFIG, OPTIONS, POLICY, START, Run, is_finished, read_run, save_run, unfinished
-from lodestone.agents.saved import AnyPolicy, save_policy
+from lodestone.agents.saved import save_policy
 from lodestone.errors import CannotWrite
 from lodestone.files import lock, prepare_folder, write_atomically
 from lodestone.learning.checkpoints import Checkpoints

@@ -18,9 +18,7 @@ from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
 from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
 from lodestone.agents.option_critic import OptionCriticConfig, option_critic
-from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
-from lodestone.agents.sarsa import SarsaConfig, sarsa
-from lodestone.agents.saved import (
+from lodestone.agents.policies import (
     AnyPolicy,
     GoalPolicy,
     MachinePolicy,
@@ -29,6 +27,8 @@ from lodestone.agents.saved import (
     Policy,
     UnitedPolicy,
 )
+from lodestone.agents.q_learning import STEPS_PER_ROUND, QLearningConfig, q_learning
+from lodestone.agents.sarsa import SarsaConfig, sarsa
 from lodestone.agents.straw import StrawConfig, straw
 from lodestone.agents.united import UnitedConfig, united
 from lodestone.envs.base import Environment, OutsideEnvironment, observation_shape

@@ -15,9 +15,10 @@ from rich.table import Table
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig, as_configured
 from lodestone.agents.playing import episodes_to_judge, play_many
+from lodestone.agents.policies import AnyPolicy
 from lodestone.agents.run import Run, load_start
 from lodestone.agents.run_folder import RunFolder
-from lodestone.agents.saved import AnyPolicy, load_options
+from lodestone.agents.saved import load_options
 from lodestone.agents.training import AGENTS, AgentConfig, check_training, train_policy
 from lodestone.cli.parsing import parse, settings_of, take_environment, take_name
 from lodestone.cli.printing import note, print_json

@@ -21,8 +21,8 @@ import jax
 
 from lodestone.agents.dqn import DQNConfig
 from lodestone.agents.playing import play, record
+from lodestone.agents.policies import Policy
 from lodestone.agents.pretraining import Judgement, Pretrained, as_options, pretrain
-from lodestone.agents.saved import Policy
 from lodestone.agents.training import train_policy
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.errors import check_name

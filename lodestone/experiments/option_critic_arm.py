@@ -17,7 +17,7 @@ from scipy.special import expit
 
 from lodestone.agents.deep_option_critic import DeepOptionCriticConfig, deep_option_critic
 from lodestone.agents.playing import EPISODES, play_many
-from lodestone.agents.saved import OptionCriticPolicy
+from lodestone.agents.policies import OptionCriticPolicy
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.state_space import reachable_states
 from lodestone.experiments.comparison import Gate, at_least, at_most

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.agents.playing import MAX_STEPS
-from lodestone.agents.saved import PlanPolicy
+from lodestone.agents.policies import PlanPolicy
 from lodestone.agents.straw import StrawConfig
 from lodestone.agents.training import train_policy
 from lodestone.envs.base import Environment

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lodestone.agents.playing import play
-from lodestone.agents.saved import UnitedPolicy
+from lodestone.agents.policies import UnitedPolicy
 from lodestone.agents.training import train_policy
 from lodestone.agents.united import UnitedConfig
 from lodestone.envs.magnet_arm import MagnetArm

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lodestone.agents.playing import play
+from lodestone.agents.policies import UnitedPolicy
 from lodestone.agents.pretraining import judge
-from lodestone.agents.saved import UnitedPolicy
 from lodestone.agents.training import train_policy
 from lodestone.agents.united import UnitedConfig
 from lodestone.envs.magnet_arm import MagnetArm

@@ -16,10 +16,10 @@ from lodestone.agents.hdqn import HDQNConfig
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.option_critic import OptionCriticConfig
+from lodestone.agents.policies import UnitedPolicy
 from lodestone.agents.q_learning import QLearningConfig
 from lodestone.agents.run import CONFIG, Run, read_run, save_run
 from lodestone.agents.sarsa import SarsaConfig
-from lodestone.agents.saved import UnitedPolicy
 from lodestone.agents.straw import StrawConfig
 from lodestone.agents.training import AGENTS, train_policy
 from lodestone.agents.united import UnitedConfig

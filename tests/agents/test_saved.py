@@ -10,17 +10,8 @@ import pytest
 
 from lodestone.agents.option_critic import nothing_learned
 from lodestone.agents.playing import play, record
-from lodestone.agents.saved import (
-    GoalPolicy,
-    OptionCriticPolicy,
-    PlanPolicy,
-    Policy,
-    UnitedPolicy,
-    load_options,
-    load_policy,
-    save_options,
-    save_policy,
-)
+from lodestone.agents.policies import GoalPolicy, OptionCriticPolicy, PlanPolicy, Policy, UnitedPolicy
+from lodestone.agents.saved import load_options, load_policy, save_options, save_policy
 from lodestone.envs.base import example_state
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, arm_is_down, go_down_task, random_layouts

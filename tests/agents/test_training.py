@@ -16,7 +16,8 @@ from lodestone.agents.hamq import HAMQConfig
 from lodestone.agents.hdqn import HDQNConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.playing import play, play_many, record
-from lodestone.agents.saved import GoalPolicy, MachinePolicy, UnitedPolicy, save_policy
+from lodestone.agents.policies import GoalPolicy, MachinePolicy, UnitedPolicy
+from lodestone.agents.saved import save_policy
 from lodestone.agents.training import train_policy
 from lodestone.agents.united import UnitedConfig
 from lodestone.envs.magnet_arm import MagnetArm

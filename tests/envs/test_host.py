@@ -15,7 +15,8 @@ from lodestone.agents.deep_option_critic import DeepOptionCriticConfig
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.playing import play_many
-from lodestone.agents.saved import Policy, load_policy, save_policy
+from lodestone.agents.policies import Policy
+from lodestone.agents.saved import load_policy, save_policy
 from lodestone.agents.training import train_policy
 from lodestone.envs.host import FromFunction, HostEnvironment, Registered, visit
 from lodestone.envs.registry import make_environment

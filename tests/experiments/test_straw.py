@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lodestone.agents.saved import PlanPolicy
+from lodestone.agents.policies import PlanPolicy
 from lodestone.envs.goal_maze import GOALS, NEIGHBOURS
 from lodestone.experiments import straw
 from lodestone.learning.networks import NetworkConfig

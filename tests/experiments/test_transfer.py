@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lodestone.agents.saved import UnitedPolicy
+from lodestone.agents.policies import UnitedPolicy
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.experiments import transfer
 from lodestone.learning.networks import NetworkConfig
