@@ -261,6 +261,19 @@ def policy_loss(
     return optax.huber_loss(values[action], jax.lax.stop_gradient(target), delta=config.huber_delta)
 
 
+def after_basic_step(
+    config: UnitedConfig, actions: Float[Array, " A"], choices: Float[Array, " n+1"]
+) -> Float[Array, " A+n"]:
+    """What may follow a step of the basic policy, for its own target: another such step, which is another decision, or
+    an option.
+
+    The manager's value of its first choice would say the same of the next step, but it learns from the manager's
+    decisions alone; the basic policy's own values learn from all steps, those on the options' tasks included, so they
+    are known far from the ways that are taken now.
+    """
+    return jnp.concatenate([actions - config.decision_cost * config.reward_scale, choices[1:]])
+
+
 def _target(
     config: UnitedConfig,
     reward: Float[Array, ""],
@@ -334,8 +347,10 @@ def loss(
             rewards = jax.vmap(task.reward)(steps.state, steps.action, steps.next_state)
             ends = jax.vmap(task.terminal)(steps.next_state)
             after, preferred = next_values[:, head], preferences[:, head]
-            if head == BASIC and "manager" in learns:  # after one step of the basic policy the manager chooses
-                after, preferred = jax.vmap(target.manager)(seen_next), jax.vmap(network.manager)(held)
+            if head == BASIC and "manager" in learns:
+                follows = jax.vmap(partial(after_basic_step, config))
+                after = follows(after, jax.vmap(target.manager)(seen_next))
+                preferred = follows(preferred, jax.vmap(network.manager)(held))
             of_head = jax.vmap(partial(policy_loss, config, discount))
             losses = of_head(values[:, head], after, preferred, steps.action, rewards, ends)
             total += config.policy_weight * jnp.sum(losses)

@@ -101,7 +101,12 @@ def numpy_loss(config, stage, network, target, steps, decisions):
             part = "basic policy" if head == 0 else "option policies"
             reward = after - 7.0 if head == 0 else 10.0 * (after == goal) - 1.0
             if head == 0 and "manager" in stage.learns:
-                later = best(target_choices, next_choices, np.ones(3))
+                cost = config.decision_cost * config.reward_scale
+                follows = [
+                    np.append(actions[0] - cost, chosen[1:])
+                    for actions, chosen in ((target_actions, target_choices), (next_actions, next_choices))
+                ]
+                later = best(*follows, np.ones(4))
             else:
                 later = best(target_actions[head], next_actions[head], np.ones(2))
             wanted = reward * config.reward_scale + (0 if after == goal else GAMMA * later)
