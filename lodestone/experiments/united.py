@@ -69,11 +69,13 @@ SIZES = (
         replace(
             _CONFIG,
             epsilon=((0.15, 1.0), (0.3, 0.4), (0.75, 0.2), (1.0, 0.02)),
-            learning_rate=((0.0, 1e-3), (0.7, 1e-3), (1.0, 1e-5)),
+            learning_rate=((0.0, 1e-3), (0.5, 1e-3), (0.65, 3e-4), (0.8, 1e-4), (0.9, 3e-5), (1.0, 1e-5)),
             learning_starts=20_000,
+            target_period=100,
             ticks_per_round=4,
+            updates_per_round=6,
         ),
-        480_000,
+        640_000,
         50.0,
     ),
 )
