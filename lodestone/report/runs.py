@@ -21,7 +21,7 @@ from lodestone.envs.host import Registered
 from lodestone.envs.registry import describe_environment
 from lodestone.errors import BadFile, EnvironmentFailed, InvalidConfig, TooManyStates
 from lodestone.experiments.study import NumberTable, Panel, Series, Study
-from lodestone.files import read_json
+from lodestone.files import read_file, read_json
 from lodestone.planning.solve import Optimum, optimum
 from lodestone.report.page import number_text
 from lodestone.report.statistics import RESAMPLES, estimate
@@ -108,19 +108,18 @@ def _name(folder: Path) -> str:
 
 def _read_metrics(path: Path, seeds: Sequence[int]) -> tuple[tuple[str, ...], tuple[Lines, ...]]:
     """The choices, and every seed's lines; what a run that is still going on has only half written is left out."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise BadFile(f"{path} cannot be read: there is nothing to report before a run's first progress.") from None
+    if not path.exists():
+        raise BadFile(f"{path} cannot be read: there is nothing to report before a run's first progress.")
+    content = read_file(path)
     rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in seeds}
     try:
-        for line in text.splitlines():
+        for line in content.decode().splitlines():
             row = json.loads(line)
             rows[row["seed"]].append(row)
         count = min(map(len, rows.values()))
         choices = tuple(rows[seeds[0]][0]["calls"]) if count else ()
         lines = tuple(_lines(rows[seed][:count], choices) for seed in seeds)
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise BadFile(f"{path} is damaged: every line has to be the JSON object of one seed's progress.") from None
     if not count:
         raise BadFile(f"{path} has no line of every seed yet.")
