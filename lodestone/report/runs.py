@@ -48,6 +48,8 @@ class Lines:
     """Not a number before the first episode has ended."""
     calls: Float[np.ndarray, "T O"]
     """Of each choice, since the line before."""
+    steps_of_calls: Float[np.ndarray, "T O"]
+    """Primitive steps that these took; not numbers in the metrics of an older version."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,13 @@ def _lines(rows: Sequence[Mapping[str, Any]], choices: tuple[str, ...]) -> Lines
     def column(name: str) -> Float[np.ndarray, " T"]:
         return np.array([row[name] for row in rows], dtype=np.float64)  # None is not a number
 
-    calls = np.array([[row["calls"][choice] for choice in choices] for row in rows], dtype=np.float64)
-    return Lines(column("steps"), column("decisions"), column("seconds"), column("mean_return"), calls)
+    def of_choices(name: str) -> Float[np.ndarray, "T O"]:
+        return np.array([[row[name][choice] for choice in choices] for row in rows], dtype=np.float64)
+
+    calls = of_choices("calls")
+    tell = all("steps_of_calls" in row for row in rows)
+    steps_of_calls = of_choices("steps_of_calls") if tell else np.full_like(calls, np.nan)
+    return Lines(column("steps"), column("decisions"), column("seconds"), column("mean_return"), calls, steps_of_calls)
 
 
 def study_of(learners: Sequence[Learner]) -> Study:
@@ -147,7 +154,10 @@ def study_of(learners: Sequence[Learner]) -> Study:
         tables.append(_times(place, here, best))
         if len(here) > 1:
             tables.append(_improvements(place, here))
-    panels += [_usage(learner) for learner in learners if 1 < len(learner.choices) <= FEW_CHOICES]
+    for learner in learners:
+        if 1 < len(learner.choices) <= FEW_CHOICES:
+            panels.append(_usage(learner))
+            panels += _lengths(learner)
     return Study(
         name="runs",
         title="Training runs",
@@ -280,23 +290,43 @@ def _interval(middle: float, low: float, high: float) -> str:
 
 
 def _usage(learner: Learner) -> Panel:
-    x = np.linspace(0, min(lines.steps[-1] for lines in learner.seeds), POINTS)
     shares = [lines.calls / np.maximum(lines.calls.sum(axis=1, keepdims=True), 1) for lines in learner.seeds]
     return Panel(
         title=f"{learner.name}: choices taken",
         x_label="primitive steps",
         y_label="share of decisions",
-        series=tuple(
-            Series(
-                choice,
-                x,
-                np.stack(
-                    [_between(x, lines.steps, share[:, at]) for lines, share in zip(learner.seeds, shares, strict=True)]
-                ),
-            )
-            for at, choice in enumerate(learner.choices)
-        ),
+        series=_by_choice(learner, shares),
         y_range=(0.0, 1.0),
+    )
+
+
+def _lengths(learner: Learner) -> list[Panel]:
+    """One, if some choice takes more than a step and the metrics tell."""
+    with np.errstate(invalid="ignore"):  # none were called: not a number
+        lengths = [lines.steps_of_calls / lines.calls for lines in learner.seeds]
+    if not any((each > 1).any() for each in lengths):
+        return []
+    series = _by_choice(learner, lengths)
+    return [
+        Panel(
+            title=f"{learner.name}: how long choices last",
+            x_label="primitive steps",
+            y_label="mean steps of a call",
+            series=series,
+        )
+    ]
+
+
+def _by_choice(learner: Learner, values: Sequence[Float[np.ndarray, "T O"]]) -> tuple[Series, ...]:
+    """A curve of each choice, from the values of every seed."""
+    x = np.linspace(0, min(lines.steps[-1] for lines in learner.seeds), POINTS)
+    return tuple(
+        Series(
+            choice,
+            x,
+            np.stack([_between(x, lines.steps, each[:, at]) for lines, each in zip(learner.seeds, values, strict=True)]),
+        )
+        for at, choice in enumerate(learner.choices)
     )
 
 
