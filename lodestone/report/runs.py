@@ -324,7 +324,9 @@ def _by_choice(learner: Learner, values: Sequence[Float[np.ndarray, "T O"]]) -> 
         Series(
             choice,
             x,
-            np.stack([_between(x, lines.steps, each[:, at]) for lines, each in zip(learner.seeds, values, strict=True)]),
+            np.stack(
+                [_between(x, lines.steps, each[:, at]) for lines, each in zip(learner.seeds, values, strict=True)]
+            ),
         )
         for at, choice in enumerate(learner.choices)
     )
