@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-g
 
 DESKTOP, PHONE = 1280, 390
 """Widths."""
-LONG = "a-name-without-a-space-" * 8
+LONG = "a_name_without_a_space_" * 8
 
 
 @pytest.fixture(scope="module")
