@@ -302,7 +302,7 @@ def _usage(learner: Learner) -> Panel:
 
 def _lengths(learner: Learner) -> list[Panel]:
     """One, if some choice takes more than a step and the metrics tell."""
-    with np.errstate(invalid="ignore"):  # none were called: not a number
+    with np.errstate(all="ignore"):  # none were called: not a number
         lengths = [lines.steps_of_calls / lines.calls for lines in learner.seeds]
     if not any((each > 1).any() for each in lengths):
         return []
