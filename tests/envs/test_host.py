@@ -203,6 +203,7 @@ def test_what_does_not_fit_is_refused(walk):
         primitives(Registered("Nothing-v0"))
 
 
+@pytest.mark.filterwarnings("ignore:.*is not in the possible render_modes")
 def test_one_that_knows_no_render_mode_has_no_pictures():
     gymnasium.register("Walk-v0", entry_point=Walk)
     bare = Registered("Walk-v0")
