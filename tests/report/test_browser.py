@@ -107,6 +107,7 @@ FRAMES = """new Promise(done => {
 """Frames a second, each of which shows another step."""
 
 
+@pytest.mark.slow
 def test_the_player_holds_thirty_frames_a_second(report, chromium):
     chromium.open(report, DESKTOP)
     assert max(chromium.value(FRAMES) for _ in range(3)) > 30
