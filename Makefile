@@ -26,6 +26,7 @@ benchmarks: .venv/installed
 	$(BIN)/python benchmarks/tabular.py
 	$(BIN)/python benchmarks/hierarchies.py
 	$(BIN)/python benchmarks/training.py
+	$(BIN)/python benchmarks/hosts.py
 	$(BIN)/python benchmarks/checkpointing.py
 
 # The stamp is newer than what it was installed from, so a change of dependencies installs again.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import stat
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,7 +42,7 @@ def lock(path: Path) -> BinaryIO:
     systems) it holds nothing.
     """
     try:
-        file = path.open("ab")
+        file = path.open("ab+")  # to read, too: else a pipe of this name would keep the program waiting
     except OSError as error:
         raise CannotWrite(f"The output folder {path.parent} cannot be written: {error.strerror or error}.") from None
     try:
@@ -99,15 +100,33 @@ def json_safe(value: object) -> Any:
 def write_json(path: str | Path, content: object) -> None:
     """Indented JSON of `json_safe(content)`. Raises `CannotWrite`."""
     text = json.dumps(json_safe(content), indent=2, ensure_ascii=False, allow_nan=False)
-    write_atomically(path, f"{text}\n".encode())
+    write_atomically(path, f"{text}\n".encode(errors="backslashreplace"))
+
+
+def read_file(path: Path) -> bytes:
+    """Raises `BadFile`."""
+    _refuse_devices(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise BadFile(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def _refuse_devices(path: Path) -> None:
+    """Raise `BadFile` for a pipe or a device: reading could go on for ever."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return  # which the attempt to read it will say better
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise BadFile(f"{path} cannot be read: it is no file.")
 
 
 def read_json(path: Path) -> Any:
     """Raises `BadFile`."""
+    content = read_file(path)
     try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise BadFile(f"{path} cannot be read: {error.strerror or error}.") from None
+        return json.loads(content)
     except (ValueError, RecursionError):
         raise BadFile(f"{path} is no JSON file.") from None
 
@@ -120,6 +139,7 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], header: dict[str, An
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What `write_arrays` wrote. Raises `BadFile` for a missing, truncated or foreign file."""
+    _refuse_devices(path)
     try:
         with safe_open(path, framework="numpy") as file:
             header = (file.metadata() or {}).get(HEADER)

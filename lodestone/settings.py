@@ -1,13 +1,39 @@
-"""Settings out of JSON: data classes of plain values, with every field checked."""
+"""Settings out of JSON: data classes of plain values, with every field checked; and numbers that fit compiled code."""
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from lodestone.errors import InvalidConfig, check_name
+
+LARGEST, LARGEST_FLOAT = 2**31 - 1, 3.4e38
+"""The largest numbers of compiled code: an int32, and (nearly) a float32."""
+
+
+def check_numbers(settings: Any, name: str) -> None:
+    """Raise `InvalidConfig` for a number that compiled code cannot hold, anywhere in settings or in JSON.
+
+    Infinities and NaN are left to those who know what a setting is for."""
+    match settings:
+        case bool():
+            return
+        case int() | float():
+            largest = LARGEST if isinstance(settings, int) else LARGEST_FLOAT
+            if largest < abs(settings) < math.inf:
+                raise InvalidConfig(f"{name} is {settings!s:.60}, but may be at most {largest}.")
+        case dict():
+            for key, value in settings.items():
+                check_numbers(value, key)
+        case list() | tuple():
+            for value in settings:
+                check_numbers(value, name)
+        case _ if is_dataclass(settings):
+            for field in fields(settings):
+                check_numbers(getattr(settings, field.name), field.name)
 
 
 def from_json(kind: Any, value: Any, name: str) -> Any:

@@ -17,7 +17,9 @@ from lodestone.agents.playing import play_many
 from lodestone.agents.saved import load_policy
 from lodestone.agents.training import AGENTS
 from lodestone.cli import main
+from lodestone.cli.discover import Discover
 from lodestone.cli.train import Train
+from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS, environment_class
 from lodestone.errors import UnknownName
 from lodestone.experiments.registry import EXPERIMENTS, experiment
@@ -299,6 +301,14 @@ REFUSED = [
     (["train", "intra-option", "magnet-arm", "--options", "lift", "--option-cap", "9"], "stopped after 9 steps"),
     (["train", "intra-option", "magnet-arm", "--call-cost", "0.5"], "call_cost is 0.5"),
     (["plan", "four-rooms", "--goal", "104"], "goal is 104"),
+    (["plan", "chain", "--length", "10001"], "length is 10001"),
+    (["plan", "magnet-arm", "--columns", "1001"], "columns is 1001"),
+    (["plan", "magnet-arm", "--tower-reward", "1e39"], "tower_reward is 1e+39, but may be at most 3.4e+38"),
+    (["plan", "random-mdp", "--states", "5000"], "states is 5000"),
+    (["plan", "corridor-maze", "--length", "10000"], "1000000 squares"),
+    (["train", "dqn", "chain", "--steps", "9" * 20], "but may be at most 2147483647"),
+    (["train", "dqn", "chain", "--seeds", "100001"], "at most 100000"),
+    (["watch", "y" * 300], "File name too long"),
     (["train", "dqn", "magnet-arm", "--options", "missing.safetensors"], "missing.safetensors"),
     (["train", "maxq", "magnet-arm", "--out", "run"], "no ready-made task graph for magnet-arm"),
     (["train", "hamq", "chain", "--out", "run"], "no ready-made machines for chain"),
@@ -369,10 +379,13 @@ def flags(settings: type) -> list[str]:
     return [one for name in names for one in (flags(inner[name]) if name in inner else [name])]
 
 
-@pytest.mark.parametrize("agent", list(AGENTS))
+@pytest.mark.parametrize(
+    ("command", "part"),
+    [*((Train, kind) for kind in AGENTS.values()), *((Discover, kind) for kind in METHODS.values())],
+)
 @pytest.mark.parametrize("environment", list(ENVIRONMENTS))
-def test_no_two_settings_have_one_name(agent, environment):
-    names = [*flags(Train), *flags(AGENTS[agent]), *flags(environment_class(environment))]
+def test_no_two_settings_have_one_name(command, part, environment):
+    names = [*flags(command), *flags(part), *flags(environment_class(environment))]
     assert sorted(set(names)) == sorted(names)
 
 

@@ -117,7 +117,7 @@ REFUSED = [
     ([*HOUSE, "--method", "eigenoptions", "--number", "3"], "come in pairs"),
     ([*HOUSE, "--method", "eigenoptions", "--number", "400"], "400 options need 200 eigenvectors"),
     ([*HOUSE, "--method", "betweenness", "--number", "-1"], "number is -1"),
-    ([*HOUSE, "--method", "betweenness", "--starts", "point"], "--starts"),
+    ([*HOUSE, "--method", "betweenness", "--initiation", "point"], "--initiation"),
     ([*HOUSE, "--method", "diverse-density", "--steps", "1", "--trajectories", "1"], "None of 1 trajectories"),
     ([*HOUSE, "--method", "covering", "--from", "trajectories", "--trajectories", "2", "--steps", "3"], "pieces"),
     ([*HOUSE, "--method", "covering", "--from", "moon"], "moon"),
@@ -140,6 +140,6 @@ def test_bad_input_is_refused_in_a_sentence(words, sentence, capsys, tmp_path, m
 def test_help_names_the_settings_of_the_method(capsys):
     code, out, _ = run(capsys, *HOUSE, "--method", "covering", "--help")
     assert code == 0
-    assert "--starts" in out
+    assert "--initiation" in out
     assert "--from" in out
     assert "--goal" in out

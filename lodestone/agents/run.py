@@ -27,7 +27,7 @@ from lodestone.files import read_json, write_json
 from lodestone.learning.checkpoints import FORMAT
 from lodestone.options.base import Options
 from lodestone.options.execution import Rules
-from lodestone.settings import from_json
+from lodestone.settings import check_numbers, from_json
 
 CONFIG, OPTIONS, START, POLICY = "config.json", "options.safetensors", "start.safetensors", "policy.safetensors"
 
@@ -66,6 +66,8 @@ class Run:
             raise InvalidConfig(f"steps is {self.steps}, but must be at least 1.")
         if not self.seeds:
             raise InvalidConfig("Training needs at least one seed.")
+        if len(set(self.seeds)) < len(self.seeds):
+            raise InvalidConfig("seeds must differ from one another.")
         if not all(-(2**31) <= seed < 2**31 for seed in self.seeds):
             raise InvalidConfig(f"seeds must be from {-(2**31)} to {2**31 - 1}.")
         if not 0 <= self.checkpoint_every < math.inf:
@@ -143,6 +145,7 @@ def read_run(folder: Path) -> Run:
 def _settings(content: dict[str, Any]) -> tuple[AgentConfig, Environment, _Plain]:
     if content["format"] != FORMAT:
         raise InvalidConfig(f"its format is {content['format']!r}, and version {__version__} reads {FORMAT}.")
+    check_numbers(content, "it")
     agent, world = dict(content.pop("agent")), dict(content.pop("environment"))
     name, world_name, parameters = agent.pop("name"), world.pop("name"), world.pop("parameters")
     check_name("agent", name, tuple(AGENTS))

@@ -112,6 +112,7 @@ def _metrics(history: History, chunk: int, position: int, seed: int) -> dict[str
         "success_rate": _mean(episodes.success[recent]),
         "loss": float(usage.loss[position]),
         "calls": dict(zip(history.choices, usage.calls[position].tolist(), strict=True)),
+        "steps_of_calls": dict(zip(history.choices, usage.steps[position].tolist(), strict=True)),
         "seconds": round(usage.seconds, 3),
     }
 

@@ -47,6 +47,7 @@ from lodestone.options.networks import NetworkOptions
 from lodestone.options.scripted import Scripted
 from lodestone.options.tabular import TabularOptions
 from lodestone.planning.joint import joint_process
+from lodestone.settings import check_numbers
 
 Recipe = dict[str, Any]
 T = TypeVar("T")
@@ -299,7 +300,8 @@ def load_options(path: Path, environment: Environment) -> Options:
 def _read(path: Path, kind: str) -> tuple[Arrays, Recipe]:
     arrays, header = read_arrays(path)
     if header.get("kind") != kind:
-        raise BadFile(f"{path} holds {header.get('kind', 'something else')}, but {kind} were expected.")
+        raise BadFile(f"{path} holds {header.get('kind', 'something else')!s:.60}, but {kind} were expected.")
+    refuse_bad(path, lambda: check_numbers(header, "it"))
     return arrays, header
 
 
@@ -370,7 +372,7 @@ def _build_options(recipe: Recipe, arrays: Arrays, prefix: str, environment: Env
         case "union":
             parts = enumerate(recipe["parts"])
             return Union(tuple(_build_options(part, arrays, f"{prefix}/{index}", environment) for index, part in parts))
-    raise BadFile(f"options of an unknown kind, {recipe['kind']!r}")
+    raise BadFile(f"options of an unknown kind, {recipe['kind']!r:.60}.")
 
 
 def _describe_network(network: QNetwork) -> Recipe:

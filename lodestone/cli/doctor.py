@@ -23,7 +23,7 @@ EXTRAS = {
     "pygame": ("pictures of Gymnasium's own environments", "pygame"),
     "minigrid": ("MiniGrid environments, as minigrid:ID", "minigrid"),
     "ale-py": ("Atari environments, as ale_py:ID", "ale-py"),
-    "stable-baselines3": ("benchmarks beside Stable-Baselines3", "lodestone[benchmarks]"),
+    "stable-baselines3": ("benchmarks beside Stable-Baselines3, and its learners over options", "lodestone[bridges]"),
     "pytest": ("running the tests", "lodestone[dev]"),
 }
 """Packages that not everyone needs: what for, and what to install."""

@@ -11,6 +11,10 @@ from lodestone.envs.base import Environment
 from lodestone.envs.host import Registered, is_registered
 from lodestone.envs.registry import ENVIRONMENTS, environment_class
 from lodestone.errors import InvalidConfig, UnknownName, check_name
+from lodestone.settings import check_numbers
+
+MAX_SEEDS = 100_000
+"""That are trained at once."""
 
 
 def take_name(kind: str, known: tuple[str, ...], command: str, words: list[str]) -> tuple[str, list[str]]:
@@ -47,11 +51,20 @@ def take_environment(command: str, words: list[str]) -> tuple[str, type[Environm
     return name, environment_class(name), rest
 
 
+def check_seeds(seeds: int) -> None:
+    """Raises `InvalidConfig`."""
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise InvalidConfig(f"seeds is {seeds}, but must be at least 1 and at most {MAX_SEEDS}.")
+
+
 def settings_of(command: Any, *kinds: type) -> Any:
     """A command's settings for an agent and an environment that are known only now."""
     return command[kinds]
 
 
 def parse(settings: Any, command: str, words: list[str]) -> Any:
-    """Parsing errors leave with exit code 2 from inside tyro, after one boxed sentence."""
-    return tyro.cli(settings, args=words, prog=f"lodestone {command}", config=(OmitArgPrefixes,))
+    """Parsing errors leave with exit code 2 from inside tyro, after one boxed sentence. Raises `InvalidConfig` for a
+    number that is too large."""
+    found = tyro.cli(settings, args=words, prog=f"lodestone {command}", config=(OmitArgPrefixes,))
+    check_numbers(found, command)
+    return found

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.saved import save_options
-from lodestone.cli.parsing import parse, settings_of, take_environment
+from lodestone.cli.parsing import check_seeds, parse, settings_of, take_environment
 from lodestone.cli.printing import print_json
 from lodestone.console import ConsoleProgress
 from lodestone.envs.base import Environment
@@ -58,6 +58,7 @@ def _pretrain(settings: Pretrain) -> None:
     found = tasks(environment)
     if not found:
         raise InvalidConfig(f"{describe_environment(environment)['name']} has no training tasks for options.")
+    check_seeds(settings.seeds)
     prepare_folder(settings.out.parent)
     training = magnet_tower.settings("3", "fast").pretraining["lift"]
     config = dataclasses.replace(training.config, network=settings.network)

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
+
+from jax.errors import JaxRuntimeError
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
@@ -51,9 +54,15 @@ experiments: {", ".join((reproduce.MAGNET_TOWER, *EXPERIMENTS))}
 Add --help after a command and its names for all settings. lodestone --version prints the version.
 """
 
+NO_MEMORY = ("RESOURCE_EXHAUSTED", "Out of memory")
+"""What errors of XLA say of it."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a path may have characters that cannot be printed
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(USAGE, end="")
@@ -66,9 +75,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_name("command", words[0], tuple(COMMANDS))
         COMMANDS[words[0]](words[1:])
     except LodestoneError as error:
-        print(f"lodestone: {error}", file=sys.stderr)
-        return 2
+        return _refuse(str(error))
+    except OSError as error:  # a path that no file can have, or a disk or a terminal that went away
+        return _refuse(f"{error.filename or 'The output'}: {error.strerror or error}.")
+    except (MemoryError, JaxRuntimeError) as error:
+        if isinstance(error, JaxRuntimeError) and not any(word in str(error) for word in NO_MEMORY):
+            raise
+        return _refuse("This would take more memory than there is.")
     except KeyboardInterrupt as interrupt:
         print(f"\nlodestone: {str(interrupt) or 'interrupted.'}", file=sys.stderr)
         return 130
     return 0
+
+
+def _refuse(sentence: str) -> int:
+    print(f"lodestone: {sentence}", file=sys.stderr)
+    return 2

@@ -12,7 +12,7 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
-from lodestone.cli.parsing import parse
+from lodestone.cli.parsing import check_seeds, parse
 from lodestone.cli.printing import print_json
 from lodestone.console import ConsoleProgress
 from lodestone.errors import InvalidConfig, check_name
@@ -61,8 +61,8 @@ def _reproduce(settings: Reproduce) -> None:
         _list_experiments(settings.json)
         return
     check_name("experiment", settings.experiment, (MAGNET_TOWER, *EXPERIMENTS))
-    if settings.seeds is not None and settings.seeds < 1:
-        raise InvalidConfig(f"seeds is {settings.seeds}, but must be at least 1.")
+    if settings.seeds is not None:
+        check_seeds(settings.seeds)
     if settings.experiment == MAGNET_TOWER:
         _reproduce_towers(settings, settings.seeds or TOWER_SEEDS, settings.out or Path("out/reproduce"))
         return

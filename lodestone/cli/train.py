@@ -20,7 +20,7 @@ from lodestone.agents.run import Run, load_start
 from lodestone.agents.run_folder import RunFolder
 from lodestone.agents.saved import load_options
 from lodestone.agents.training import AGENTS, AgentConfig, check_training, train_policy
-from lodestone.cli.parsing import parse, settings_of, take_environment, take_name
+from lodestone.cli.parsing import check_seeds, parse, settings_of, take_environment, take_name
 from lodestone.cli.printing import note, print_json
 from lodestone.console import ConsoleProgress
 from lodestone.envs.base import Environment, OutsideEnvironment
@@ -84,8 +84,7 @@ def run(words: list[str]) -> None:
 
 
 def _train(train: Train) -> None:
-    if train.seeds < 1:
-        raise InvalidConfig(f"seeds is {train.seeds}, but must be at least 1.")
+    check_seeds(train.seeds)
     environment, rules = train.environment, train.rules
     options = _choose_options(train)
     start = None if train.from_run is None else load_start(train.from_run)

@@ -28,7 +28,10 @@ from lodestone.discovery.reaching import Destination, nearest, options_to
 from lodestone.errors import CannotDiscover, InvalidConfig
 from lodestone.options.tabular import TabularOptions
 
-Starts = Literal["point", "everywhere"]
+Initiation = Literal["point", "everywhere"]
+
+MAX_NUMBER = 1000
+"""Of options: every two take an eigenvector."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +40,16 @@ class CoveringConfig:
 
     number: int = 8
     """Options: two for each pair of ends."""
-    starts: Starts = "point"
+    initiation: Initiation = "point"
     """Where an option may start. `point`: at the other end of its pair only. `everywhere`: where there is a way."""
 
     def __post_init__(self) -> None:
-        if self.number < 2 or self.number % 2:
-            raise InvalidConfig(f"number is {self.number}, but covering options come in pairs: 2, 4, ...")
-        if self.starts not in get_args(Starts):
-            raise InvalidConfig(f"starts is {self.starts!r}, but must be one of {', '.join(get_args(Starts))}.")
+        if not 2 <= self.number <= MAX_NUMBER or self.number % 2:
+            raise InvalidConfig(f"number is {self.number}, but covering options come in pairs: 2, 4, ... {MAX_NUMBER}.")
+        if self.initiation not in get_args(Initiation):
+            raise InvalidConfig(
+                f"initiation is {self.initiation!r}, but must be one of {', '.join(get_args(Initiation))}."
+            )
 
 
 class Covering(NamedTuple):
@@ -90,7 +95,7 @@ def covering(knowledge: Knowledge, config: CoveringConfig) -> Covering:
     destinations, pair_of = [], []
     for position, (high, low) in enumerate(pairs):
         for begin, end, way in ((high, low, "down"), (low, high, "up")):
-            there = _destination(graph, begin, end, f"cover-{position + 1}-{way}", config.starts)
+            there = _destination(graph, begin, end, f"cover-{position + 1}-{way}", config.initiation)
             if there is not None:
                 destinations.append(there)
                 pair_of.append(position)
@@ -119,11 +124,13 @@ def with_edge(undirected: sparse.csr_array, one: int, other: int) -> sparse.csr_
     return as_undirected(undirected.maximum(new))
 
 
-def _destination(graph: InteractionGraph, begin: int, end: int, name: str, starts: Starts) -> Destination | None:
+def _destination(
+    graph: InteractionGraph, begin: int, end: int, name: str, initiation: Initiation
+) -> Destination | None:
     """None where no way leads from one vertex to the other."""
     there, here = int(graph.states[end]), int(graph.states[begin])
     region = nearest(graph, there, None)
     if not region[here]:
         return None
     only_here = np.arange(graph.num_states) == here
-    return Destination(name, there, region, region if starts == "everywhere" else only_here)
+    return Destination(name, there, region, region if initiation == "everywhere" else only_here)

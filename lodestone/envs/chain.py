@@ -22,6 +22,9 @@ from lodestone.errors import InvalidConfig
 
 LEFT, RIGHT = range(2)
 
+MAX_LENGTH = 10_000
+"""Of a chain: a longer one takes too long to find its states, step by step."""
+
 
 class ChainState(NamedTuple):
     """Where the agent is, and where it has been."""
@@ -49,8 +52,8 @@ class Chain(Environment):
     """What the agent sees: 0/1 planes over the row, or the number of the state."""
 
     def __check_init__(self) -> None:
-        if self.length < 2:
-            raise InvalidConfig(f"length is {self.length}, but must be at least 2.")
+        if not 2 <= self.length <= MAX_LENGTH:
+            raise InvalidConfig(f"length is {self.length}, but must be from 2 to {MAX_LENGTH}.")
         if not 2 <= self.start <= self.length:
             raise InvalidConfig(f"start is {self.start}, but must be from 2 to {self.length}, the length.")
         if not 0 <= self.right_success <= 1:

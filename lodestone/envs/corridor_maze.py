@@ -92,6 +92,10 @@ def maze_layout(rows: int, columns: int, width: int, length: int, obstacle_prob:
     return MazeLayout(free, obstacles, squares, neighbours, at_intersection, start, goal)
 
 
+MAX_SQUARES = 1_000_000
+"""Of a maze, walls included."""
+
+
 class MazeState(NamedTuple):
     """Where the agent is."""
 
@@ -129,6 +133,11 @@ class CorridorMaze(Environment):
         for name, least in (("rows", 1), ("columns", 1), ("width", 1), ("length", 3), ("pixels_per_cell", 1)):
             if getattr(self, name) < least:
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least {least}.")
+        if self.rows * self.columns * (self.width + self.length) ** 2 > MAX_SQUARES:
+            raise InvalidConfig(
+                f"A maze of {self.rows} x {self.columns} intersections, corridors {self.width} wide and {self.length} "
+                f"long has more than {MAX_SQUARES} squares."
+            )
         if self.rows * self.columns < 2:
             raise InvalidConfig("rows and columns are both 1, but start and goal need two intersections.")
         for name in ("obstacle_prob", "move_success"):

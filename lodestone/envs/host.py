@@ -151,10 +151,13 @@ class Registered(HostEnvironment):
 
     def build(self, render_mode: str | None = None) -> gymnasium.Env:
         limit = self.max_episode_steps
+        pictures = {} if render_mode is None else {"render_mode": render_mode}  # which not every environment takes
         try:
-            made = gymnasium.make(self.id, limit, disable_env_checker=True, render_mode=render_mode)
+            made = gymnasium.make(self.id, limit, disable_env_checker=True, **pictures)
         except (gymnasium.error.Error, ImportError) as error:
             raise InvalidConfig(f"Gymnasium cannot make {self.id}: {str(error).rstrip('.')}.") from None
+        except TypeError as error:
+            raise EnvironmentFailed(f"Gymnasium cannot make {self.id}: {str(error).rstrip('.')}.") from None
         return made if self.observation is None else _entry(made, self.observation)
 
 

@@ -41,6 +41,9 @@ figure 1 names the two arm colours the other way round."""
 MAX_ROWS = 31
 """A column is one non-negative int32."""
 
+MAX_COLUMNS = 1000
+"""More would only take memory."""
+
 
 class ArmState(NamedTuple):
     """Where everything is. Small integer types: a replay of a million transitions holds states."""
@@ -81,6 +84,8 @@ class MagnetArm(Environment):
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
         if self.rows < 2 or self.rows > MAX_ROWS:
             raise InvalidConfig(f"rows is {self.rows}, but must be from 2 to {MAX_ROWS}: the arm needs the top row.")
+        if self.columns > MAX_COLUMNS:
+            raise InvalidConfig(f"columns is {self.columns}, but must be at most {MAX_COLUMNS}.")
         room = (self.rows - 1) * self.columns
         if self.bricks > room:
             raise InvalidConfig(

@@ -33,6 +33,10 @@ def random_dynamics(
     return probs, rewards
 
 
+MAX_PAIRS = 10_000_000
+"""Of states, with every action."""
+
+
 class NumberedState(NamedTuple):
     """A state is a number."""
 
@@ -60,6 +64,11 @@ class RandomMDP(Environment):
         for name, least in (("mdp_seed", 0), ("states", 1), ("actions", 1)):
             if getattr(self, name) < least:
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least {least}.")
+        if self.states**2 * self.actions > MAX_PAIRS:
+            raise InvalidConfig(
+                f"states is {self.states} and actions is {self.actions}, but states x actions x states must be at most "
+                f"{MAX_PAIRS}: they are tables."
+            )
         if not 0 <= self.goals < self.states:
             raise InvalidConfig(
                 f"goals is {self.goals}, but must be from 0 to {self.states - 1}: episodes begin in another state."

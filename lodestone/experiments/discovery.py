@@ -139,7 +139,7 @@ def _house_numbers() -> list[tuple[str, float, float]]:
         rows.append(
             (f"diffusion time, {2 * vectors} eigenoptions", diffusion_times(HOUSE, options)[vectors > 0], wanted)
         )
-    everywhere = discover(HOUSE, CoveringConfig(number=8, starts="everywhere")).options
+    everywhere = discover(HOUSE, CoveringConfig(number=8, initiation="everywhere")).options
     _, together = diffusion_times(HOUSE, everywhere)
     rows.append(("diffusion time, 8 covering options from everywhere", together, COVERING_DIFFUSION))
     return rows

@@ -21,7 +21,7 @@ from lodestone.envs.host import Registered
 from lodestone.envs.registry import describe_environment
 from lodestone.errors import BadFile, EnvironmentFailed, InvalidConfig, TooManyStates
 from lodestone.experiments.study import NumberTable, Panel, Series, Study
-from lodestone.files import read_json
+from lodestone.files import read_file, read_json
 from lodestone.planning.solve import Optimum, optimum
 from lodestone.report.page import number_text
 from lodestone.report.statistics import RESAMPLES, estimate
@@ -48,6 +48,8 @@ class Lines:
     """Not a number before the first episode has ended."""
     calls: Float[np.ndarray, "T O"]
     """Of each choice, since the line before."""
+    steps_of_calls: Float[np.ndarray, "T O"]
+    """Primitive steps that these took; not numbers in the metrics of an older version."""
 
 
 @dataclass(frozen=True)
@@ -108,19 +110,18 @@ def _name(folder: Path) -> str:
 
 def _read_metrics(path: Path, seeds: Sequence[int]) -> tuple[tuple[str, ...], tuple[Lines, ...]]:
     """The choices, and every seed's lines; what a run that is still going on has only half written is left out."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise BadFile(f"{path} cannot be read: there is nothing to report before a run's first progress.") from None
+    if not path.exists():
+        raise BadFile(f"{path} cannot be read: there is nothing to report before a run's first progress.")
+    content = read_file(path)
     rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in seeds}
     try:
-        for line in text.splitlines():
+        for line in content.decode().splitlines():
             row = json.loads(line)
             rows[row["seed"]].append(row)
         count = min(map(len, rows.values()))
         choices = tuple(rows[seeds[0]][0]["calls"]) if count else ()
         lines = tuple(_lines(rows[seed][:count], choices) for seed in seeds)
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         raise BadFile(f"{path} is damaged: every line has to be the JSON object of one seed's progress.") from None
     if not count:
         raise BadFile(f"{path} has no line of every seed yet.")
@@ -131,8 +132,13 @@ def _lines(rows: Sequence[Mapping[str, Any]], choices: tuple[str, ...]) -> Lines
     def column(name: str) -> Float[np.ndarray, " T"]:
         return np.array([row[name] for row in rows], dtype=np.float64)  # None is not a number
 
-    calls = np.array([[row["calls"][choice] for choice in choices] for row in rows], dtype=np.float64)
-    return Lines(column("steps"), column("decisions"), column("seconds"), column("mean_return"), calls)
+    def of_choices(name: str) -> Float[np.ndarray, "T O"]:
+        return np.array([[row[name][choice] for choice in choices] for row in rows], dtype=np.float64)
+
+    calls = of_choices("calls")
+    tell = all("steps_of_calls" in row for row in rows)
+    steps_of_calls = of_choices("steps_of_calls") if tell else np.full_like(calls, np.nan)
+    return Lines(column("steps"), column("decisions"), column("seconds"), column("mean_return"), calls, steps_of_calls)
 
 
 def study_of(learners: Sequence[Learner]) -> Study:
@@ -148,7 +154,10 @@ def study_of(learners: Sequence[Learner]) -> Study:
         tables.append(_times(place, here, best))
         if len(here) > 1:
             tables.append(_improvements(place, here))
-    panels += [_usage(learner) for learner in learners if 1 < len(learner.choices) <= FEW_CHOICES]
+    for learner in learners:
+        if 1 < len(learner.choices) <= FEW_CHOICES:
+            panels.append(_usage(learner))
+            panels += _lengths(learner)
     return Study(
         name="runs",
         title="Training runs",
@@ -281,23 +290,45 @@ def _interval(middle: float, low: float, high: float) -> str:
 
 
 def _usage(learner: Learner) -> Panel:
-    x = np.linspace(0, min(lines.steps[-1] for lines in learner.seeds), POINTS)
     shares = [lines.calls / np.maximum(lines.calls.sum(axis=1, keepdims=True), 1) for lines in learner.seeds]
     return Panel(
         title=f"{learner.name}: choices taken",
         x_label="primitive steps",
         y_label="share of decisions",
-        series=tuple(
-            Series(
-                choice,
-                x,
-                np.stack(
-                    [_between(x, lines.steps, share[:, at]) for lines, share in zip(learner.seeds, shares, strict=True)]
-                ),
-            )
-            for at, choice in enumerate(learner.choices)
-        ),
+        series=_by_choice(learner, shares),
         y_range=(0.0, 1.0),
+    )
+
+
+def _lengths(learner: Learner) -> list[Panel]:
+    """One, if some choice takes more than a step and the metrics tell."""
+    with np.errstate(all="ignore"):  # none were called: not a number
+        lengths = [lines.steps_of_calls / lines.calls for lines in learner.seeds]
+    if not any((each > 1).any() for each in lengths):
+        return []
+    series = _by_choice(learner, lengths)
+    return [
+        Panel(
+            title=f"{learner.name}: how long choices last",
+            x_label="primitive steps",
+            y_label="mean steps of a call",
+            series=series,
+        )
+    ]
+
+
+def _by_choice(learner: Learner, values: Sequence[Float[np.ndarray, "T O"]]) -> tuple[Series, ...]:
+    """A curve of each choice, from the values of every seed."""
+    x = np.linspace(0, min(lines.steps[-1] for lines in learner.seeds), POINTS)
+    return tuple(
+        Series(
+            choice,
+            x,
+            np.stack(
+                [_between(x, lines.steps, each[:, at]) for lines, each in zip(learner.seeds, values, strict=True)]
+            ),
+        )
+        for at, choice in enumerate(learner.choices)
     )
 
 

@@ -150,6 +150,7 @@ def test_a_gymnasium_environment_comes_back_and_has_no_checkpoints(tmp_path):
     [
         ({"steps": 0}, "steps is 0"),
         ({"seeds": ()}, "at least one seed"),
+        ({"seeds": (1, 2, 1)}, "seeds must differ"),
         ({"seeds": (2**31,)}, "seeds must be from -2147483648 to 2147483647"),
         ({"checkpoint_every": -1.0}, "checkpoint_every is -1.0"),
         ({"checkpoint_every": float("nan")}, "checkpoint_every is nan"),

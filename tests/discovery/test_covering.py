@@ -63,9 +63,9 @@ def test_an_option_goes_from_one_end_to_the_other_by_a_shortest_way() -> None:
 def test_where_options_may_start_matters() -> None:
     """Between the ends they speed a random walk up; from everywhere to the ends they hold it back."""
     times = {}
-    for starts in ("point", "everywhere"):
-        options = Union((Primitives(HOUSE.action_names), covering(house(), CoveringConfig(8, starts)).options))
-        times[starts] = diffusion_time(house().tables, tabulate_options(options, house().tables.space))
+    for initiation in ("point", "everywhere"):
+        options = Union((Primitives(HOUSE.action_names), covering(house(), CoveringConfig(8, initiation)).options))
+        times[initiation] = diffusion_time(house().tables, tabulate_options(options, house().tables.space))
     assert times["everywhere"] == pytest.approx(4362.68, abs=0.005)
     assert times["point"] == pytest.approx(326.28, abs=0.005)
 
@@ -101,7 +101,11 @@ def test_the_states_of_the_pairs_are_where_they_should_be() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "sentence"),
-    [({"number": 0}, "number is 0"), ({"number": 5}, "come in pairs"), ({"starts": "moon"}, "starts is 'moon'")],
+    [
+        ({"number": 0}, "number is 0"),
+        ({"number": 5}, "come in pairs"),
+        ({"initiation": "moon"}, "initiation is 'moon'"),
+    ],
 )
 def test_settings_out_of_range_are_refused(settings: dict, sentence: str) -> None:
     with pytest.raises(InvalidConfig, match=sentence):

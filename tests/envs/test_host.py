@@ -203,6 +203,16 @@ def test_what_does_not_fit_is_refused(walk):
         primitives(Registered("Nothing-v0"))
 
 
+@pytest.mark.filterwarnings("ignore:.*is not in the possible render_modes")
+def test_one_that_knows_no_render_mode_has_no_pictures():
+    gymnasium.register("Walk-v0", entry_point=Walk)
+    bare = Registered("Walk-v0")
+    assert primitives(bare).names == ("0", "1")
+    with pytest.raises(EnvironmentFailed, match="unexpected keyword argument 'render_mode'"), visit(bare, film=True):
+        pass
+    gymnasium.registry.pop("Walk-v0")
+
+
 def test_a_file_does_not_import_what_it_likes():
     with pytest.raises(InvalidConfig, match="has to be imported before"):
         make_environment("gymnasium", id="antigravity:Fly-v0")

@@ -32,7 +32,9 @@ def write(folder: Path, returns: dict[int, list[float | None]], discount: float 
             if chunk < len(values):
                 steps = 100 * (chunk + 1)
                 calls = {"left": 25 * seed, "right": 100 - 25 * seed}
+                lasted = {"left": calls["left"], "right": 3 * calls["right"]}
                 told = {"seed": seed, "steps": steps, "decisions": steps // 2, "seconds": steps / 10, "calls": calls}
+                told |= {"steps_of_calls": lasted}
                 lines.append(json.dumps({**told, "mean_return": values[chunk]}) + "\n")
     (folder / "metrics.jsonl").write_text("".join(lines))
     return folder
@@ -57,6 +59,9 @@ def test_curves_and_numbers_are_those_of_the_metrics(tmp_path):
     assert reference[1] == pytest.approx(0.208, abs=1e-3)  # the chain's optimum
     usage = next(panel for panel in study.panels if panel.title == "good: choices taken")
     np.testing.assert_allclose(usage.series[0].seeds[1][100], 0.25)
+    lengths = next(panel for panel in study.panels if panel.title == "good: how long choices last")
+    np.testing.assert_allclose([series.seeds[1][100] for series in lengths.series], [1, 3])
+    assert np.isnan(lengths.series[0].seeds[0]).all()  # never called
     ends = table(study.tables, "where they ended")
     assert ends["good"][0] == 2
     assert ends["good"][1].startswith("0.35 [0.3, 0.4]")
