@@ -90,7 +90,7 @@ def test_gymnasium_takes_it(observation):
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"length": 1}, "length is 1, but must be at least 2"),
+        ({"length": 1}, "length is 1, but must be from 2 to 10000"),
         ({"start": 1}, "start is 1, but must be from 2 to 6"),
         ({"start": 7}, "start is 7"),
         ({"right_success": 1.1}, "right_success is 1.1"),
