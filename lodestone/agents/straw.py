@@ -8,9 +8,9 @@ round N environments take L steps each, and then one gradient step is taken on t
 
 where pi = softmax(A^t[:, 0]), V_t is the last row of the same column, g_t says whether step t planned anew, KL_t is the
 divergence of STRAWe's noisy code, c^t[0] the probability of planning anew at the next step, and G_t the lambda-return.
-Adv_t is G_t - V_t less its mean over the round, divided by its deviation, without a gradient. The gradient runs back
-through the plans of the L steps to the round's first one, which is taken as it was left. The draws of g_t are those of
-the steps that were taken, and pass the gradient straight through.
+Adv_t is G_t - V_t without a gradient. The gradient runs back through the plans of the L steps to the round's first
+one, which is taken as it was left. The draws of g_t are those of the steps that were taken, and pass the gradient
+straight through.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class StrawConfig:
     """Shape of what plans are made from: the last hidden layer is the features, and as wide as the code."""
     plan: PlanConfig = field(default_factory=PlanConfig)
     """Shape of the plans."""
-    commitment_cost: Knots = ((0.0, 0.02), (0.45, 0.02), (0.65, 0.35))
-    """lambda over the run: cost of the probability of planning anew, beside advantages of deviation 1. What is done is
-    learned first, and then to do it with few plans."""
+    commitment_cost: Knots = ((0.0, 0.0), (0.5, 0.0), (0.7, 0.06))
+    """lambda over the run: cost of the probability of planning anew, in scaled reward. What is done is learned first,
+    and then to do it with few plans."""
     noise_cost: float = 0.001
     """alpha: cost of the divergence of a noisy code; of no meaning without noise."""
-    entropy: Knots = ((0.0, 0.02), (1.0, 0.0))
-    """eta over the run."""
-    value_weight: float = 0.5
+    entropy: Knots = ((0.0, 0.006), (1.0, 0.0))
+    """eta over the run, beside scaled rewards."""
+    value_weight: float = 1.0
     """Weight of the squared error of the values."""
     decay: float = 0.95
     """lambda of the returns: 0 looks one step ahead, 1 to the end of the round or of the episode."""
@@ -71,8 +71,8 @@ class StrawConfig:
     rollout: int = 16
     """L, steps of every environment between two updates; so far back the gradient runs."""
     reward_scale: float = 1.0
-    """Factor on rewards inside the learner. Advantages are normalised, so that it is the weight of values: near 1 they
-    are learned fastest, and the larger they are, the more a look is worth beside its cost."""
+    """Factor on rewards inside the learner; values near 1 are learned fastest. Large ones drive the bounded code to its
+    bounds before any reward is found, where all states look the same."""
 
     @property
     def steps_per_round(self) -> int:
@@ -180,7 +180,6 @@ def loss(
     """The mean loss of N L steps, at weights that change over the run."""
     missed = told.target - told.value
     advantage = jax.lax.stop_gradient(missed)
-    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
     return jnp.mean(
         -told.log_prob * advantage
         - entropy * told.entropy

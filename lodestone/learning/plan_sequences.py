@@ -28,16 +28,18 @@ class SequenceConfig:
 
     network: NetworkConfig = field(default_factory=lambda: NetworkConfig((), (), (), (32,)))
     """Shape of what plans are made from."""
-    plan: PlanConfig = field(default_factory=PlanConfig)
+    plan: PlanConfig = field(default_factory=lambda: PlanConfig(peak=18.0))
     """Shape of the plans."""
     commitment_cost: float = 0.01
     """lambda: cost of the probability of planning anew, beside nats a symbol."""
     noise_cost: float = 0.0001
     """alpha: cost of the divergence of a noisy code; of no meaning without noise."""
-    sharpness: Knots = ((0.0, 0.3), (0.1, 0.3), (0.75, 1.0))
-    """Over the run, factor on the logits of commitments."""
-    learning_rate: Knots = ((0.0, 3e-3), (0.8, 3e-3), (1.0, 0.0))
-    """Adam's step size over the run."""
+    sharpness: Knots = ((0.0, 0.0), (0.3, 0.0), (0.3, 0.3), (0.5, 0.3), (0.95, 1.0))
+    """Over the run, factor on the logits of commitments. With 0, every other step plans anew, and nothing is learned of
+    commitments: first what follows is learned."""
+    learning_rate: Knots = ((0.0, 3e-3), (0.15, 3e-3), (0.3, 5e-4), (0.8, 5e-4), (1.0, 1e-4))
+    """Adam's step size over the run. It falls before commitments are learned: a plan that still errs where it could be
+    sure is worth looking again, more than the look costs, and once learned such a look stays."""
     max_gradient_norm: float = 1.0
     """Every weight and bias array's gradient is scaled down to this norm."""
     sequences: int = 16

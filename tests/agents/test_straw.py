@@ -159,10 +159,9 @@ def numpy_loss(one, plan, taken, entropy_weight):
             target[t] = steps.reward[t] + steps.discount[t] * ahead
         everything += [(*row, target[t], steps.action[t]) for t, row in enumerate(rows)]
     missed = np.array([target - value for _, value, _, _, _, target, _ in everything])
-    advantages = (missed - missed.mean()) / (missed.std() + 1e-6)
     total = 0.0
-    for (probs, _, _, apart, c, _, action), wrong, advantage in zip(everything, missed, advantages, strict=True):
-        total -= np.log(probs[action]) * advantage
+    for (probs, _, _, apart, c, _, action), wrong in zip(everything, missed, strict=True):
+        total -= np.log(probs[action]) * wrong
         total += entropy_weight * (probs * np.log(probs)).sum()
         total += CONFIG.value_weight / 2 * wrong**2 + CONFIG.noise_cost * apart + 0.3 * c
     return total / len(everything)

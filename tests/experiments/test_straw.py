@@ -67,8 +67,8 @@ def test_lengths_of_plans_are_steps_over_plans_chunk_by_chunk():
 
 
 def test_a_short_run_learns_the_grammar_but_not_yet_when_to_look():
-    found = straw.read(2, 600, lambda done, text: None)
-    assert (found.surprise[:, 0] > 1.0).all()
+    found = straw.read(2, 1200, lambda done, text: None)
+    assert (found.surprise[:, 0] > 4 * straw.ENTROPY_RATE).all()
     assert (found.judged < 1.3 * straw.ENTROPY_RATE).all()
     assert (found.judged > 0.9 * straw.ENTROPY_RATE).all()
     assert (found.anew[:, straw.BRANCH] > 0.8).all()
@@ -76,7 +76,7 @@ def test_a_short_run_learns_the_grammar_but_not_yet_when_to_look():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="grammar, maze and arm miss some of their numbers: docs/straw.md has them")
+@pytest.mark.xfail(strict=True, reason="maze and arm miss some of their numbers: docs/straw.md has them")
 def test_all_numbers_come_out():
     failed = [gate for gate in straw.run(10, Silent()).gates if not gate.passed]
     assert failed == []
