@@ -255,7 +255,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("maxq", ["two-rooms"], "30000"),
         ("hamq", ["magnet-arm", *TINY], "20000"),
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
-        ("united", ["magnet-arm", *TINY, *SMALL], "12000"),
+        ("united", ["magnet-arm", *TINY, *SMALL], "40000"),
         ("hdqn", ["magnet-arm", *TINY, *SMALL, *GOALS], "20000"),
         ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
         ("deep-option-critic", ["magnet-arm", *TINY, *SHAPE, "--reward-scale", "0.2"], "80000"),
@@ -270,7 +270,8 @@ def test_hierarchies_are_trained_saved_and_watched(agent, environment, steps, ca
     found = json.loads(out)
     assert code == 0
     assert all(row["success"] > 0.9 for row in found["seeds"])
-    assert all(row["steps"] >= 0.95 * int(steps) for row in found["seeds"])  # the last choice is not over
+    # The last choice is not over; a united network spends a tick on every new episode.
+    assert all(row["steps"] + row["episodes"] >= 0.95 * int(steps) for row in found["seeds"])
     policy = load_policy(tmp_path / "run" / "policy.safetensors")
     again = play_many(policy, jax.random.key(0), found["greedy_episodes"])
     assert again.total_reward.mean(axis=1).tolist() == [row["greedy_return"] for row in found["seeds"]]

@@ -9,7 +9,7 @@ from lodestone.learning.progress import Silent
 
 
 def test_a_short_run_plans_exactly_and_shows_every_learner(monkeypatch):
-    monkeypatch.setattr(hallways, "STEPS", 3000)
+    monkeypatch.setattr(hallways, "STEPS", 9000)
     monkeypatch.setattr(hallways, "LOOKS", 3)
     study = hallways.run(2, Silent())
     assert [gate.passed for gate in study.gates[:2]] == [True, True]
