@@ -26,11 +26,12 @@ from lodestone.envs.chain import Chain
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.task import Task
 from lodestone.experiments.comparison import Gate, at_least
+from lodestone.experiments.curves import WINDOW, returns_in_training
 from lodestone.experiments.following import Followed, follow
 from lodestone.experiments.magnet_tower import FLAT, OPTION_CAP, WITH_OPTIONS, settings
 from lodestone.experiments.study import Experiment, NumberTable, Panel, Series, Study
 from lodestone.learning.goal_network import GoalNetwork, GoalOptions
-from lodestone.learning.history import History, running_mean
+from lodestone.learning.history import History
 from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.progress import Progress
 from lodestone.options.base import Capped, Options, Primitives, Union
@@ -75,8 +76,6 @@ STEPS_PER_DECISION = 1.2
 others."""
 ARM_WORK = 10.0 * CHAIN_STEPS
 """What a learner of the tower takes, about, beside one of the chain."""
-WINDOW = 50
-"""Episodes whose mean return is shown."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +137,16 @@ def run(seeds: int, progress: Progress) -> Study:
             "goals are: a brick in hand beside a tower of one or two, a standing tower of two or three."
         ),
         seeds=seeds,
-        panels=(_chain_panel(followed), _tower_panel(towers)),
+        panels=(
+            _chain_panel(followed),
+            returns_in_training(
+                "Tower: return in training",
+                {name: one.history for name, one in towers.items()},
+                ARM_STEPS,
+                optimum(ARM).optimal_return,
+                (-210.0, 100.0),
+            ),
+        ),
         tables=(
             _exact_values(),
             NumberTable(
@@ -269,28 +277,6 @@ def _chain_panel(followed: dict[str, Followed]) -> Panel:
         tuple(Series(name, x, one.at(one.steps, x)) for name, one in followed.items()),
         references=((f"optimum {best:.3f}", best),),
         y_range=(0.0, 0.22),
-    )
-
-
-def _tower_panel(towers: dict[str, Tower]) -> Panel:
-    best = optimum(ARM).optimal_return
-    x = np.linspace(0, ARM_STEPS, 150)
-
-    def rows(one: Tower) -> Float[np.ndarray, "N X"]:
-        curves = []
-        for seed in range(len(one.steps)):
-            episodes = one.history.episodes(seed)
-            means = np.insert(running_mean(episodes.total_reward, WINDOW), 0, np.nan)
-            curves.append(means[np.searchsorted(episodes.steps, x, side="right")])
-        return np.stack(curves)
-
-    return Panel(
-        "Tower: return in training",
-        "primitive steps",
-        f"return, mean of {WINDOW} episodes",
-        tuple(Series(name, x, rows(one)) for name, one in towers.items()),
-        references=((f"optimum {best:g}", best),),
-        y_range=(-210.0, 100.0),
     )
 
 

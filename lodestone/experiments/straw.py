@@ -26,9 +26,10 @@ from lodestone.envs.base import Environment
 from lodestone.envs.goal_maze import GoalMaze
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.experiments.comparison import Gate, at_least, at_most
+from lodestone.experiments.curves import WINDOW, returns_in_training
 from lodestone.experiments.study import Experiment, NumberTable, Panel, Series, Study
 from lodestone.learning.evaluation import Episode
-from lodestone.learning.history import History, running_mean
+from lodestone.learning.history import History
 from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.plan_execution import play_on, start_planning
 from lodestone.learning.plan_network import PlanConfig, PlanNetwork
@@ -82,8 +83,6 @@ ARM_CONFIG = StrawConfig(
     reward_scale=0.02,
 )
 """A new plan, of one step, at every step."""
-WINDOW = 50
-"""Episodes whose mean return is shown."""
 WORK = {"grammar": 1.0, PLANNING: 2.0, EVERY_STEP: 2.0, "tower": 8.0}
 """What each part takes, about, beside the others."""
 
@@ -273,10 +272,16 @@ def run(seeds: int, progress: Progress) -> Study:
             _surprise_panel(reading),
             _gates_panel(reading),
             _plan_panel(reading),
-            _return_panel("Maze: return in training", mazes, MAZE_STEPS, best_maze.optimal_return, (-50.0, 20.0)),
+            returns_in_training(
+                "Maze: return in training", _histories(mazes), MAZE_STEPS, best_maze.optimal_return, (-50.0, 20.0)
+            ),
             _length_panel(mazes),
-            _return_panel(
-                "Tower: return in training", {PLANNING: tower}, ARM_STEPS, best_arm.optimal_return, (-210.0, 100.0)
+            returns_in_training(
+                "Tower: return in training",
+                _histories({PLANNING: tower}),
+                ARM_STEPS,
+                best_arm.optimal_return,
+                (-210.0, 100.0),
             ),
         ),
         tables=(
@@ -335,27 +340,8 @@ def _plan_panel(reading: Reading) -> Panel:
     )
 
 
-def _return_panel(
-    title: str, learners: dict[str, Trained], steps: int, best: float, y_range: tuple[float, float]
-) -> Panel:
-    x = np.linspace(0, steps, 150)
-
-    def rows(one: Trained) -> Float[np.ndarray, "N X"]:
-        curves = []
-        for seed in range(len(one.steps)):
-            episodes = one.history.episodes(seed)
-            means = np.insert(running_mean(episodes.total_reward, WINDOW), 0, np.nan)
-            curves.append(means[np.searchsorted(episodes.steps, x, side="right")])
-        return np.stack(curves)
-
-    return Panel(
-        title,
-        "primitive steps",
-        f"return, mean of {WINDOW} episodes",
-        tuple(Series(name, x, rows(one)) for name, one in learners.items()),
-        references=((f"optimum {best:.4g}", best),),
-        y_range=y_range,
-    )
+def _histories(learners: dict[str, Trained]) -> dict[str, History]:
+    return {name: one.history for name, one in learners.items()}
 
 
 def _length_panel(mazes: dict[str, Trained]) -> Panel:
