@@ -255,7 +255,7 @@ def test_choices_of_the_towers_are_refused_elsewhere(choice, invented, capsys, t
         ("maxq", ["two-rooms"], "30000"),
         ("hamq", ["magnet-arm", *TINY], "20000"),
         ("hamq", ["taxi", "--step-limit", "200", "--discount", "1"], "150000"),
-        ("united", ["magnet-arm", *TINY, *SMALL], "40000"),
+        ("united", ["magnet-arm", *TINY, *SMALL, "--hidden", "64"], "40000"),
         ("hdqn", ["magnet-arm", *TINY, *SMALL, *GOALS], "20000"),
         ("option-critic", ["four-rooms", "--step-limit", "1000"], "30000"),
         ("deep-option-critic", ["magnet-arm", *TINY, *SHAPE, "--reward-scale", "0.2"], "80000"),
