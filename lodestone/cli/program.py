@@ -13,7 +13,7 @@ from jax.errors import JaxRuntimeError
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
-from lodestone.cli import discover, doctor, plan, pretrain, report, reproduce, resume, train, watch
+from lodestone.cli import completion, discover, doctor, plan, pretrain, report, reproduce, resume, train, watch
 from lodestone.devices import use_all_cores
 from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS
@@ -30,6 +30,7 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "plan": plan.run,
     "discover": discover.run,
     "doctor": doctor.run,
+    "completion": completion.run,
 }
 """What each command does with the words after its name."""
 
@@ -47,6 +48,7 @@ commands:
   plan ENVIRONMENT           the exact optimum
   discover ENVIRONMENT       find options by --method {", ".join(METHODS)}
   doctor                     what is installed here, what is missing, and how to get it
+  completion SHELL           a script that completes all these words on TAB, for bash, zsh or fish
 
 environments: {", ".join(ENVIRONMENTS)}
 experiments: {", ".join((reproduce.MAGNET_TOWER, *EXPERIMENTS))}
