@@ -25,6 +25,7 @@ from lodestone.cli.pretrain import Pretrain
 from lodestone.cli.report import Report
 from lodestone.cli.reproduce import MAGNET_TOWER, Reproduce
 from lodestone.cli.resume import Resume
+from lodestone.cli.tensorboard import TensorBoard
 from lodestone.cli.train import Train
 from lodestone.cli.watch import Watch
 from lodestone.discovery.catalogue import METHODS
@@ -54,6 +55,7 @@ SETTINGS: dict[str, type] = {
     "pretrain": Pretrain,
     "watch": Watch,
     "report": Report,
+    "tensorboard": TensorBoard,
     "plan": Plan,
     "discover": Discover,
     "doctor": Doctor,
@@ -61,7 +63,7 @@ SETTINGS: dict[str, type] = {
 }
 """Every command's settings."""
 
-COMMANDS_OF_FILES = ("resume", "watch", "report")
+COMMANDS_OF_FILES = ("resume", "watch", "report", "tensorboard")
 MANY = 99
 """Words after a flag that takes any number of them."""
 
