@@ -102,7 +102,7 @@ def flags_of(settings: type) -> Iterator[Flag]:
             yield from flags_of(kind)  # type: ignore[arg-type]
         elif kind is bool:
             yield Flag(f"--no-{name}" if field.default is True else f"--{name}")
-        elif name == "options":
+        elif name == "options":  # text to the parser; `options` has the names
             yield Flag("--options", MANY, files=True)
         elif name == "experiment":
             yield Flag("--experiment", 1, (MAGNET_TOWER, *EXPERIMENTS))

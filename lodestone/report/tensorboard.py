@@ -41,7 +41,7 @@ def write_events(folder: Path) -> Path:
     for seed, rows in zip(seeds, read_rows(path, seeds), strict=True):
         try:
             events = [Event(wall_time=began + row["seconds"], step=row["steps"], summary=_summary(row)) for row in rows]
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             raise damaged(path) from None
         with tempfile.TemporaryDirectory() as place:
             written = Path(place) / EVENTS
