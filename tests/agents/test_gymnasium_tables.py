@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.playing import play_many
 from lodestone.agents.policies import Policy
 from lodestone.agents.q_learning import QLearningConfig
@@ -69,6 +70,8 @@ class BeforeTheEnd(Options):
 
 
 DISCOUNT = 0.9
+PLACES = (4.58, 6.2, 8.0, 10.0)
+"""What the first four are worth: from the end, each -1 + 0.9 times the next."""
 
 
 @pytest.mark.parametrize(
@@ -78,13 +81,11 @@ def test_a_limit_bootstraps_an_end_does_not_and_only_what_is_allowed_is_done(con
     walk = FromFunction(Walk)
     policy, history = train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 1500, [0, 1])
     assert isinstance(policy, Policy)
-    exact = [10.0]
-    while len(exact) < 4:
-        exact.insert(0, -1 + DISCOUNT * exact[0])
-    np.testing.assert_allclose(np.asarray(policy.learned)[:, :4].max(axis=2), [exact, exact], atol=1e-3)
+    learned = np.asarray(policy.learned)
+    np.testing.assert_allclose(learned[:, :4].max(axis=2), [PLACES, PLACES], atol=1e-3)
     if isinstance(config, QLearningConfig):
-        left = [-1 + DISCOUNT * value for value in exact[:3]]
-        np.testing.assert_allclose(np.asarray(policy.learned)[:, 1:4, 0], [left, left], atol=1e-3)
+        left = -1 + DISCOUNT * np.array(PLACES[:3])
+        np.testing.assert_allclose(learned[:, 1:4, 0], [left, left], atol=1e-3)
     assert 0 < history.episodes(0).success.mean() < 1, "no episode was cut"
     assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
 
@@ -96,6 +97,18 @@ def test_an_option_that_the_limit_cuts_bootstraps_from_itself_alone():
     policy, _ = train_policy(QLearningConfig(((0.0, 1.0),), ((0.0, 1.0),)), walk, both, Rules(DISCOUNT), 1500, [0])
     assert isinstance(policy, Policy)
     np.testing.assert_allclose(np.asarray(policy.learned)[0, :4, 2], -10, atol=1e-2)
+
+
+def test_steps_teach_an_option_that_never_runs():
+    walk = FromFunction(Walk)
+    both = Union((primitives(walk), BeforeTheEnd()))
+    config = IntraOptionConfig(((0.0, 1.0),), ((0.0, 1.0),), "primitives")
+    policy, _ = train_policy(config, walk, both, Rules(DISCOUNT), 1500, [0])
+    assert isinstance(policy, Policy)
+    left, right, forever = np.asarray(policy.learned)[0, :4].T
+    np.testing.assert_allclose(right, PLACES, atol=1e-3)
+    np.testing.assert_allclose(left[1:], -1 + DISCOUNT * right[:3], atol=1e-3)
+    np.testing.assert_allclose(forever, -10, atol=1e-2)
 
 
 def test_the_cliff_is_learned_to_its_exact_optimum(tmp_path):
