@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: reproduce test lint gates benchmarks clean
+.PHONY: reproduce test lint api gates benchmarks clean
 
 reproduce: .venv/installed
 	$(BIN)/lodestone reproduce
@@ -16,6 +16,9 @@ lint: .venv/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+api: .venv/installed
+	$(BIN)/python docs/api.py out/api
 
 gates: .venv/installed
 	$(BIN)/python -m pytest -n 2 -m "slow or not slow"

@@ -26,14 +26,15 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
 from lodestone.envs.base import Environment
+from lodestone.envs.host import HostEnvironment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose, largest, mask_unavailable
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
 from lodestone.options.execution import REWARD_SWITCHES, Actor, Rules, deal, start_actor, tick, uniforms
-from lodestone.options.tabular import on_numbers
-from lodestone.planning.enumerated import enumerated, look_up_step
+from lodestone.options.tabular import TabularOptions, on_numbers
+from lodestone.planning.enumerated import Enumerated, World, enumerated, look_up_step, num_rows, row_of
 from lodestone.planning.interruption import refuse_caps
 from lodestone.planning.option_models import check_available, tabulate_options
 from lodestone.planning.tables import tabulate
@@ -109,33 +110,44 @@ def update(
 def intra_option_q_learning(
     config: IntraOptionConfig, environment: Environment, options: Options, rules: Rules, steps: int
 ) -> Algorithm:
-    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
-    `steps`.
+    """The algorithm for the training loop; it learns on the tables of the environment, or in a Gymnasium environment by
+    the number that this shows. Schedules are fractions of `steps`.
 
     Raises `TooManyStates` where the tables would be too large; `InvalidConfig` for options with a cap of more than one
-    step, whose values depend on how long they have run, and for rules under which an option's reward is not the
-    discounted sum of its steps' rewards; `NoOptionAvailable` where the behaviour has nothing to choose from.
+    step, whose values depend on how long they have run, for rules under which an option's reward is not the discounted
+    sum of its steps' rewards, and for a Gymnasium environment that shows no number; `NoOptionAvailable` where the
+    behaviour has nothing to choose from.
     """
     refuse_caps(options.names, options.max_steps, "learned from single steps")
     why = "learning within options takes the reward of an option to be the discounted sum of its steps' rewards"
     rules.refuse(REWARD_SWITCHES, why)
+    if isinstance(environment, HostEnvironment):
+        return _on_numbers(config, environment, options, rules, steps)
     tables = tabulate(environment)
-    world = enumerated(tables, environment.action_names)
-    numbered = on_numbers(options, tables.space)
-    needed = needed_chance(world, numbered)
-    one_step = np.array(options.max_steps) == 1
     chosen_from = tabulate_options(options, tables.space)
     if config.behaviour == "primitives":
+        one_step = np.array(options.max_steps) == 1
         chosen_from = chosen_from._replace(initiation=chosen_from.initiation & one_step[:, None])
     check_available(tables, chosen_from)
-    probs = np.asarray(numbered.policy_table)
-    draws = bool(((probs > 0) & (probs < 1)).any())
-    weights_of = jnp.asarray(probs.swapaxes(1, 2))  # [S, A, O], so that a step needs one row
+    world = enumerated(tables, environment.action_names)
+    return _on_numbers(config, world, on_numbers(options, tables.space), rules, steps)
+
+
+def _on_numbers(config: IntraOptionConfig, world: World, options: Options, rules: Rules, steps: int) -> Algorithm:
+    """The same in a world of numbered states, with options on these numbers, or in a Gymnasium environment, where any
+    option may draw its actions."""
+    needed, rows = needed_chance(world, options), num_rows(world)
+    one_step = np.array(options.max_steps) == 1
+    draws, weights_of = True, None
+    if isinstance(options, TabularOptions):
+        probs = np.asarray(options.policy_table)
+        draws = bool(((probs > 0) & (probs < 1)).any())
+        weights_of = jnp.asarray(probs.swapaxes(1, 2))  # [S, A, O], so that a step needs one row
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        by_action = jnp.zeros(weights_of.shape) if draws else None
-        values = Values(jnp.zeros((tables.num_states, options.size)), by_action)
+        by_action = jnp.zeros((rows, world.num_actions, options.size)) if draws else None
+        values = Values(jnp.zeros((rows, options.size)), by_action)
         return Carry(values, start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
@@ -147,24 +159,30 @@ def intra_option_q_learning(
 
         def step(carry: tuple[Values, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Values, Actor], tuple]:
             values, actor = carry
-            state = actor.state
-            available = numbered.initiation(state)
+            state, row = actor.state, row_of(world, actor.state)
+            available = options.initiation(state)
             if config.behaviour == "primitives":
                 available &= jnp.asarray(one_step)
-            choice = choose(noise[:2], values.table[state], available, epsilon)
+            choice = choose(noise[:2], values.table[row], available, epsilon)
             chance = deal(noise[2:], needed)
-            actor, decision = tick(world, numbered, rules, chance, actor, choice)
-            reward = look_up_step(world, chance.outcome, state, decision.action).reward  # of the step that was taken
-
+            actor, decision = tick(world, options, rules, chance, actor, choice)
             next_state = decision.transition.next_obs
-            next_values = values.table[next_state]
-            stops = jnp.where(jnp.asarray(one_step), 1.0, numbered.termination(next_state))
-            best = largest(mask_unavailable(next_values, numbered.initiation(next_state)))
+            if isinstance(world, Enumerated):
+                reward = look_up_step(world, chance.outcome, state, decision.action).reward  # of the step taken
+            else:
+                reward = next_state.reward
+
+            next_values = values.table[row_of(world, next_state)]
+            stops = jnp.where(jnp.asarray(one_step), 1.0, options.termination(next_state))
+            best = largest(mask_unavailable(next_values, options.initiation(next_state)))
             arriving = (1.0 - stops) * next_values + jnp.where(stops > 0, stops * best, 0.0)
             no_future = decision.terminated if rules.bootstrap_at_limit else decision.episode_ended
             target = reward + jnp.where(no_future, 0.0, rules.discount * arriving)
-            weights = weights_of[state, decision.action]
-            values, loss = update(values, state, decision.action, weights, target, learning_rate)
+            if weights_of is None:
+                weights = options.action_probs(state)[:, decision.action]
+            else:
+                weights = weights_of[row, decision.action]
+            values, loss = update(values, row, decision.action, weights, target, learning_rate)
             return (values, actor), (decision, loss)
 
         noise = uniforms(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from lodestone.agents.option_critic import Learned
 from lodestone.envs.base import Environment
+from lodestone.envs.host import HostEnvironment
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Task
 from lodestone.learning.goal_network import GoalNetwork, GoalOptions
@@ -51,6 +52,8 @@ class Policy:
         """The same of what one seed has learned."""
         if isinstance(learned, QNetwork):
             return lambda state: learned(self.environment.observe(state)) / self.reward_scale
+        if isinstance(self.environment, HostEnvironment):
+            return lambda state: learned[state.seen.observation] / self.reward_scale
         space = reachable_states(self.environment)
         return lambda state: learned[space.index_of(state)] / self.reward_scale
 

@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.envs.base import Environment
+from lodestone.envs.host import HostEnvironment
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose, largest, mask_unavailable, one_for_two
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Chance, Decision, Rules, deal, start_actor, tick, uniforms
 from lodestone.options.tabular import TabularOptions, on_numbers
-from lodestone.planning.enumerated import Enumerated, enumerated
+from lodestone.planning.enumerated import World, enumerated, num_rows, row_of
 from lodestone.planning.option_models import check_available, tabulate_options
 from lodestone.planning.tables import tabulate
 
@@ -74,7 +75,7 @@ def update(
     error, too.
 
     `values` is the row of the state where the option began. `may_cut`: whether a limit may cut an option, which alone
-    is then available in the next state; elsewhere the table says what is available.
+    is then available in the next state, or only the environment knows what is; elsewhere the table says it.
     """
     transition, (table, best) = decision.transition, learned
     option, next_value = transition.action, best[transition.next_obs]
@@ -89,8 +90,10 @@ def update(
     return Learned(table, best), jnp.square(error)
 
 
-def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...]:
+def needed_chance(world: World, options: Options) -> tuple[bool, ...]:
     """For each field of `Chance`, whether a tick needs it: drawing them takes a good part of a learner's time."""
+    if not isinstance(options, TabularOptions) or isinstance(world, HostEnvironment):
+        return (True,) * len(Chance._fields)
 
     def draws(probs: Array) -> bool:
         if isinstance(probs, jax.core.Tracer):  # of a world that is known only when the program runs
@@ -106,14 +109,24 @@ def needed_chance(world: Enumerated, options: TabularOptions) -> tuple[bool, ...
     return tuple(needed[field] for field in Chance._fields)
 
 
+def between_rows(world: World, decision: Decision) -> Decision:
+    """A decision whose states are rows of a table."""
+    transition = decision.transition
+    rows = {name: row_of(world, getattr(transition, name)) for name in ("obs", "next_obs")}
+    return decision._replace(transition=transition._replace(**rows))
+
+
 def q_learning(
     config: QLearningConfig, environment: Environment, options: Options, rules: Rules, steps: int
 ) -> Algorithm:
-    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
-    `steps`.
+    """The algorithm for the training loop; it learns on the tables of the environment, or in a Gymnasium environment by
+    the number that this shows. Schedules are fractions of `steps`.
 
-    Raises `TooManyStates` where the tables would be too large, and `NoOptionAvailable`.
+    Raises `TooManyStates` where the tables would be too large, `NoOptionAvailable`, and `InvalidConfig` for a Gymnasium
+    environment that shows no number.
     """
+    if isinstance(environment, HostEnvironment):
+        return q_learning_on_numbers(config, environment, options, rules, steps)
     tables = tabulate(environment)
     check_available(tables, tabulate_options(options, tables.space))
     world = enumerated(tables, environment.action_names)
@@ -121,14 +134,17 @@ def q_learning(
 
 
 def q_learning_on_numbers(
-    config: QLearningConfig, world: Enumerated, options: TabularOptions, rules: Rules, steps: int
+    config: QLearningConfig, world: World, options: Options, rules: Rules, steps: int
 ) -> Algorithm:
-    """The same in a world of numbered states, with options on these numbers."""
-    needed = needed_chance(world, options)
+    """The same in a world of numbered states, with options on these numbers, or in a Gymnasium environment."""
+    needed, rows = needed_chance(world, options), num_rows(world)
+    known = options.initiation_table if isinstance(options, TabularOptions) else None
+    may_cut = known is None or rules.step_limit is not None
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        learned = Learned(jnp.where(options.initiation_table, 0.0, -jnp.inf), jnp.zeros(world.ends.size))
+        table = jnp.zeros((rows, options.size)) if known is None else jnp.where(known, 0.0, -jnp.inf)
+        learned = Learned(table, jnp.zeros(rows))
         return Carry(learned, start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
@@ -141,11 +157,14 @@ def q_learning_on_numbers(
         def step(carry: tuple[Learned, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Learned, Actor], tuple]:
             learned, actor = carry
             # The row serves the choice, if there is one to make, and the update, if the option ends on this step.
-            values = learned.table[jnp.where(actor.deciding, actor.state, actor.start)]
+            state, start = row_of(world, actor.state), row_of(world, actor.start)
+            values = learned.table[jnp.where(actor.deciding, state, start)]
             uniform = jnp.stack(one_for_two(noise[0], epsilon))
-            choice = choose(uniform, values, values > -jnp.inf, epsilon)
+            available = options.initiation(actor.state) if known is None else values > -jnp.inf
+            choice = choose(uniform, values, available, epsilon)
             actor, decision = tick(world, options, rules, deal(noise[1:], needed), actor, choice)
-            learned, loss = update(learned, values, decision, learning_rate, may_cut=rules.step_limit is not None)
+            decision = between_rows(world, decision)
+            learned, loss = update(learned, values, decision, learning_rate, may_cut)
             return (learned, actor), (decision, loss)
 
         # Random numbers are drawn for all steps together: one by one they would take longer than the steps.

@@ -15,15 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from lodestone.agents.q_learning import STEPS_PER_ROUND, needed_chance
+from lodestone.agents.q_learning import STEPS_PER_ROUND, between_rows, needed_chance
 from lodestone.envs.base import Environment
+from lodestone.envs.host import HostEnvironment
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Rules, deal, start_actor, tick, uniforms
-from lodestone.options.tabular import TabularOptions, on_numbers
-from lodestone.planning.enumerated import Enumerated, enumerated
+from lodestone.options.tabular import on_numbers
+from lodestone.planning.enumerated import World, enumerated, num_rows, row_of
 from lodestone.planning.option_models import check_available, tabulate_options
 from lodestone.planning.tables import tabulate
 
@@ -54,28 +55,29 @@ class Carry(NamedTuple):
 
 
 def sarsa(config: SarsaConfig, environment: Environment, options: Options, rules: Rules, steps: int) -> Algorithm:
-    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
-    `steps`.
+    """The algorithm for the training loop; it learns on the tables of the environment, or in a Gymnasium environment by
+    the number that this shows. Schedules are fractions of `steps`.
 
-    Raises `TooManyStates` where the tables would be too large, and `NoOptionAvailable`.
+    Raises `TooManyStates` where the tables would be too large, `NoOptionAvailable`, and `InvalidConfig` for a Gymnasium
+    environment that shows no number.
     """
+    if isinstance(environment, HostEnvironment):
+        return sarsa_on_numbers(config, environment, options, rules, steps)
     tables = tabulate(environment)
     check_available(tables, tabulate_options(options, tables.space))
     world = enumerated(tables, environment.action_names)
     return sarsa_on_numbers(config, world, on_numbers(options, tables.space), rules, steps)
 
 
-def sarsa_on_numbers(
-    config: SarsaConfig, world: Enumerated, options: TabularOptions, rules: Rules, steps: int
-) -> Algorithm:
-    """The same in a world of numbered states, with options on these numbers."""
-    needed = needed_chance(world, options)
+def sarsa_on_numbers(config: SarsaConfig, world: World, options: Options, rules: Rules, steps: int) -> Algorithm:
+    """The same in a world of numbered states, with options on these numbers, or in a Gymnasium environment."""
+    needed, rows = needed_chance(world, options), num_rows(world)
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, choice_key, key = jax.random.split(key, 3)
-        table, actor = jnp.zeros((world.ends.size, options.size)), start_actor(world, actor_key)
+        table, actor = jnp.zeros((rows, options.size)), start_actor(world, actor_key)
         first = jax.random.uniform(choice_key, (2,))
-        choice = choose(first, table[actor.state], options.initiation(actor.state), jnp.float32(0))
+        choice = choose(first, table[row_of(world, actor.state)], options.initiation(actor.state), jnp.float32(0))
         return Carry(table, actor, choice, key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
@@ -88,14 +90,15 @@ def sarsa_on_numbers(
         def step(carry: tuple[Array, Actor, Array], noise: Float[Array, " N"]) -> tuple[tuple, tuple]:
             table, actor, choice = carry
             actor, decision = tick(world, options, rules, deal(noise[4:], needed), actor, choice)
-            transition = decision.transition
+            transition = between_rows(world, decision).transition
             next_values = table[transition.next_obs]
             following = choose(noise[:2], next_values, transition.next_available, epsilon)
             target = transition.reward + transition.discount * next_values[following]
             error = jnp.where(decision.valid, target - table[transition.obs, transition.action], 0.0)
             table = table.at[transition.obs, transition.action].add(learning_rate * error)
             # After an episode's end the next one begins elsewhere.
-            first = choose(noise[2:4], table[actor.state], options.initiation(actor.state), epsilon)
+            values = table[row_of(world, actor.state)]
+            first = choose(noise[2:4], values, options.initiation(actor.state), epsilon)
             choice = jnp.where(decision.episode_ended, first, following)
             return (table, actor, choice), (decision, jnp.square(error))
 

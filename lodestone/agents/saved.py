@@ -28,6 +28,7 @@ from lodestone.agents.policies import (
     UnitedPolicy,
 )
 from lodestone.envs.base import Environment, observation_shape
+from lodestone.envs.host import HostEnvironment
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Task
@@ -185,7 +186,10 @@ def load_policy(path: Path) -> AnyPolicy:
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
-            shape = (len(seeds), reachable_states(environment).size, options.size)
+            if isinstance(environment, HostEnvironment):
+                shape = (len(seeds), environment.num_states, options.size)
+            else:
+                shape = (len(seeds), reachable_states(environment).size, options.size)
             template: PyTree = jax.ShapeDtypeStruct(shape, jnp.float32)
         else:
             template = _network_template(header["network"], environment, options.size, len(seeds))

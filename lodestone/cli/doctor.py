@@ -24,6 +24,7 @@ EXTRAS = {
     "minigrid": ("MiniGrid environments, as minigrid:ID", "minigrid"),
     "ale-py": ("Atari environments, as ale_py:ID", "ale-py"),
     "stable-baselines3": ("benchmarks beside Stable-Baselines3, and its learners over options", "lodestone[bridges]"),
+    "tensorboardX": ("runs for TensorBoard", "lodestone[tensorboard]"),
     "pytest": ("running the tests", "lodestone[dev]"),
 }
 """Packages that not everyone needs: what for, and what to install."""

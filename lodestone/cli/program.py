@@ -13,7 +13,19 @@ from jax.errors import JaxRuntimeError
 
 from lodestone import __version__
 from lodestone.agents.training import AGENTS
-from lodestone.cli import discover, doctor, plan, pretrain, report, reproduce, resume, train, watch
+from lodestone.cli import (
+    completion,
+    discover,
+    doctor,
+    plan,
+    pretrain,
+    report,
+    reproduce,
+    resume,
+    tensorboard,
+    train,
+    watch,
+)
 from lodestone.devices import use_all_cores
 from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS
@@ -27,9 +39,11 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "pretrain": pretrain.run,
     "watch": watch.run,
     "report": report.run,
+    "tensorboard": tensorboard.run,
     "plan": plan.run,
     "discover": discover.run,
     "doctor": doctor.run,
+    "completion": completion.run,
 }
 """What each command does with the words after its name."""
 
@@ -44,9 +58,11 @@ commands:
   pretrain ENVIRONMENT       train an environment's options as Q-networks
   watch RUN                  play a saved policy
   report RUN ...             a page about training runs: curves, comparisons, an episode of each
+  tensorboard RUN ...        training runs for TensorBoard
   plan ENVIRONMENT           the exact optimum
   discover ENVIRONMENT       find options by --method {", ".join(METHODS)}
   doctor                     what is installed here, what is missing, and how to get it
+  completion SHELL           a script that completes all these words on TAB, for bash, zsh or fish
 
 environments: {", ".join(ENVIRONMENTS)}
 experiments: {", ".join((reproduce.MAGNET_TOWER, *EXPERIMENTS))}

@@ -130,6 +130,17 @@ class HostEnvironment(OutsideEnvironment):
         count = self.copies.count
         return state.seen.observation if count is None else jax.nn.one_hot(state.seen.observation, count)
 
+    @property
+    def num_states(self) -> int:
+        """How many numbers an observation may be, which are the states of a table. Raises `InvalidConfig` where it is
+        none."""
+        if self.copies.count is None:
+            raise InvalidConfig(
+                "A table needs observations that are one number out of n, which this environment's are not; an agent "
+                "with a network takes them."
+            )
+        return self.copies.count
+
     def render(self, state: HostState) -> UInt8[np.ndarray, "height width 3"]:
         raise NotImplementedError("A copy can only show what it is now.")
 

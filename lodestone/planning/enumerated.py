@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from lodestone.envs.base import Environment, Step, inverse_cdf
+from lodestone.envs.host import HostEnvironment
 from lodestone.planning.tables import Tables
-from lodestone.types import Observation
+from lodestone.types import Observation, State
 
 
 class Enumerated(Environment):
@@ -56,6 +57,20 @@ class Enumerated(Environment):
 
     def render(self, state: Int[Array, ""]) -> UInt8[np.ndarray, "height width 3"]:
         raise NotImplementedError("A numbered state has no picture; render the state of the environment behind it.")
+
+
+World = Enumerated | HostEnvironment
+"""What a tabular learner acts in: numbered states, or a Gymnasium environment that shows a number."""
+
+
+def num_rows(world: World) -> int:
+    """Of a table over its states. Raises `InvalidConfig` for a Gymnasium environment that shows no number."""
+    return world.ends.size if isinstance(world, Enumerated) else world.num_states
+
+
+def row_of(world: World, state: State) -> Int[Array, ""]:
+    """Of a state in such a table."""
+    return state if isinstance(world, Enumerated) else state.seen.observation
 
 
 def enumerated(tables: Tables, action_names: tuple[str, ...]) -> Enumerated:

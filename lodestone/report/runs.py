@@ -108,24 +108,38 @@ def _name(folder: Path) -> str:
     return folder.resolve().name
 
 
-def _read_metrics(path: Path, seeds: Sequence[int]) -> tuple[tuple[str, ...], tuple[Lines, ...]]:
-    """The choices, and every seed's lines; what a run that is still going on has only half written is left out."""
+def read_rows(path: Path, seeds: Sequence[int]) -> tuple[list[dict[str, Any]], ...]:
+    """Every seed's lines of the metrics, as many of each and at least one; what a run that is still going on has only
+    half written is left out. Raises `BadFile`."""
     if not path.exists():
         raise BadFile(f"{path} cannot be read: there is nothing to report before a run's first progress.")
-    content = read_file(path)
+    *lines, _ = read_file(path).split(b"\n")
     rows: dict[int, list[dict[str, Any]]] = {seed: [] for seed in seeds}
     try:
-        for line in content.decode().splitlines():
+        for line in lines:
             row = json.loads(line)
             rows[row["seed"]].append(row)
-        count = min(map(len, rows.values()))
-        choices = tuple(rows[seeds[0]][0]["calls"]) if count else ()
-        lines = tuple(_lines(rows[seed][:count], choices) for seed in seeds)
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        raise BadFile(f"{path} is damaged: every line has to be the JSON object of one seed's progress.") from None
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise damaged(path) from None
+    count = min(map(len, rows.values()))
     if not count:
         raise BadFile(f"{path} has no line of every seed yet.")
-    return choices, lines
+    return tuple(rows[seed][:count] for seed in seeds)
+
+
+def damaged(path: Path) -> BadFile:
+    """What to say of metrics that are not as they were written."""
+    return BadFile(f"{path} is damaged: every line has to be the JSON object of one seed's progress.")
+
+
+def _read_metrics(path: Path, seeds: Sequence[int]) -> tuple[tuple[str, ...], tuple[Lines, ...]]:
+    """The choices, and every seed's lines. Raises `BadFile`."""
+    rows = read_rows(path, seeds)
+    try:
+        choices = tuple(rows[0][0]["calls"])
+        return choices, tuple(_lines(each, choices) for each in rows)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+        raise damaged(path) from None
 
 
 def _lines(rows: Sequence[Mapping[str, Any]], choices: tuple[str, ...]) -> Lines:
