@@ -34,7 +34,7 @@ from lodestone.envs.base import (
     example_state,
     observation_shape,
 )
-from lodestone.envs.task import Task
+from lodestone.envs.task import Task, begun_at
 from lodestone.errors import InvalidConfig, check_name
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
@@ -149,6 +149,9 @@ class UnitedConfig:
     """Over each stage, the probability of a random action where an option is trained on its own task."""
     environments: int = 8
     """Copies of the environment, per seed, that the manager acts in."""
+    start_environments: int = 0
+    """Further copies, per seed, that the manager acts in, for every kind of start that the options' own tasks have:
+    their episodes begin there. The run's length does not count their steps, nor those on the options' tasks."""
     task_environments: int = 4
     """Copies of every option's own task, per seed, in which its policy alone acts."""
     task_step_limit: int = 100
@@ -193,6 +196,7 @@ class UnitedConfig:
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
         for name in (
             "learning_starts",
+            "start_environments",
             "policy_weight",
             "termination_weight",
             "manager_weight",
@@ -230,7 +234,8 @@ class Carry(NamedTuple):
     """Everything that one seed carries from round to round."""
 
     learner: Learner
-    actors: UnitedActor
+    actors: tuple[UnitedActor, ...]
+    """In the environment, and begun at each kind of start of the options' tasks."""
     task_actors: tuple[TaskActor, ...]
     """For every option, its environments."""
     key: PRNGKeyArray
@@ -448,9 +453,13 @@ def united(
     in_all = sum(stage.share for stage in stages)
     ends = [round(rounds * total / in_all) for total in accumulate(stage.share for stage in stages)]
     starts = [0, *ends[:-1]]
-    seen_per_round = config.ticks_per_round * (config.environments + len(options) * config.task_environments)
+    starts_of_tasks = dict.fromkeys(option.start for option in options) if config.start_environments else {}
+    places = (environment, *(begun_at(environment, start) for start in starts_of_tasks))
+    copies = (config.environments, *[config.start_environments] * len(starts_of_tasks))
+    decided_per_round = config.ticks_per_round * sum(copies)
+    seen_per_round = decided_per_round + config.ticks_per_round * len(options) * config.task_environments
     learning_starts = config.rounds(config.learning_starts)
-    powers = 1 + config.epsilon_spread * jnp.linspace(0.0, 1.0, config.environments)
+    powers = [1 + config.epsilon_spread * jnp.linspace(0.0, 1.0, count) for count in copies]
 
     def init(key: PRNGKeyArray, start: UnitedNetwork | None = None) -> Carry:
         network_key, actor_key, key = jax.random.split(key, 3)
@@ -469,16 +478,21 @@ def united(
                 Step(state, whole, state), _capacity(config.replay_capacity, seen_per_round, rounds)
             ),
             decisions=empty_prioritized(
-                Remembered(transition, whole), _capacity(config.replay_capacity, config.steps_per_round, rounds)
+                Remembered(transition, whole), _capacity(config.replay_capacity, decided_per_round, rounds)
             ),
         )
-        keys = jax.random.split(actor_key, (len(options) + 1, max(config.environments, config.task_environments)))
+        actor_keys, task_keys = jax.random.split(actor_key)
         return Carry(
             learner=learner,
-            actors=jax.vmap(partial(start_united_actor, environment))(keys[0, : config.environments]),
+            actors=tuple(
+                jax.vmap(partial(start_united_actor, place))(jax.random.split(place_key, count))
+                for place, count, place_key in zip(
+                    places, copies, jax.random.split(actor_keys, len(places)), strict=True
+                )
+            ),
             task_actors=tuple(
-                jax.vmap(partial(start_task_actor, option))(keys[position, : config.task_environments])
-                for position, option in enumerate(options, start=1)
+                jax.vmap(partial(start_task_actor, option))(jax.random.split(option_key, config.task_environments))
+                for option, option_key in zip(options, jax.random.split(task_keys, len(options)), strict=True)
             ),
             key=key,
         )
@@ -486,22 +500,28 @@ def united(
     def collect(
         stage: Stage, key: PRNGKeyArray, carry: Carry, epsilon: Float[Array, ""], task_epsilon: Float[Array, ""]
     ) -> tuple[Carry, Decision]:
-        """The round's ticks. Returns the manager's decisions, in order of time, too."""
+        """The round's ticks. Returns the manager's decisions in the environment, in order of time, too."""
         network = carry.learner.network
 
         def act(actors: tuple, tick_key: PRNGKeyArray) -> tuple[tuple, tuple]:
             united_actors, task_actors = actors
-            uniform = jax.random.uniform(tick_key, (config.environments + len(options) * config.task_environments, 4))
-            of_manager = uniform[: config.environments]
-            outputs = jax.vmap(lambda state: network(environment.observe(state)))(united_actors.actor.state)
-            decisions = jax.vmap(explore, in_axes=(0, 0, 0, None))(
-                outputs, of_manager[:, :2], epsilon**powers, "manager" in stage.learns
-            )
-            united_actors, ticks = jax.vmap(partial(tick, environment, rules, config.max_option_steps))(
-                outputs, decisions, of_manager[:, 2:], united_actors
-            )
+            key, task_key = jax.random.split(tick_key)
+            next_actors, ticked = [], []
+            keys = jax.random.split(key, len(places))
+            for place, count, power, actor, place_key in zip(places, copies, powers, united_actors, keys, strict=True):
+                uniform = jax.random.uniform(place_key, (count, 4))
+                outputs = jax.vmap(lambda state: network(environment.observe(state)))(actor.actor.state)
+                decisions = jax.vmap(explore, in_axes=(0, 0, 0, None))(
+                    outputs, uniform[:, :2], epsilon**power, "manager" in stage.learns
+                )
+                actor, ticks = jax.vmap(partial(tick, place, rules, config.max_option_steps))(
+                    outputs, decisions, uniform[:, 2:], actor
+                )
+                next_actors.append(actor)
+                ticked.append(ticks)
+            ticks = _concatenate(*ticked)
             stepped, next_task_actors = [ticks.step], []
-            of_tasks = uniform[config.environments :].reshape(len(options), config.task_environments, 4)
+            of_tasks = jax.random.uniform(task_key, (len(options), config.task_environments, 4))
             for position, (option, actor) in enumerate(zip(options, task_actors, strict=True)):
                 head = network.policy(BASIC + 1 + position)
                 values = jax.vmap(lambda state, head=head: head(environment.observe(state)))(actor.state)
@@ -510,11 +530,14 @@ def united(
                 )
                 next_task_actors.append(actor)
                 stepped.append(step)
-            return (united_actors, tuple(next_task_actors)), (ticks, _concatenate(*stepped))
+            return (tuple(next_actors), tuple(next_task_actors)), (ticks, _concatenate(*stepped))
 
         keys = jax.random.split(key, config.ticks_per_round)
         (actors, task_actors), (ticks, stepped) = jax.lax.scan(act, (carry.actors, carry.task_actors), keys)
-        acted = jnp.ones(stepped.action.shape, dtype=bool).at[:, : config.environments].set(ticks.acted)
+        acted = jnp.ones(stepped.action.shape, dtype=bool).at[:, : sum(copies)].set(ticks.acted)
+        of_environment = jax.tree.map(
+            lambda leaf: leaf[:, : config.environments].reshape(-1, *leaf.shape[2:]), ticks.decision
+        )
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (ticks, stepped, acted))
         ticks, stepped, acted = flat
         learner = carry.learner._replace(
@@ -525,7 +548,7 @@ def united(
                 ticks.decision.valid,
             ),
         )
-        return carry._replace(learner=learner, actors=actors, task_actors=task_actors), ticks.decision
+        return carry._replace(learner=learner, actors=actors, task_actors=task_actors), of_environment
 
     def run_stage(index: int, carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         stage, start, end = stages[index], starts[index], ends[index]

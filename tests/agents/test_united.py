@@ -255,6 +255,7 @@ EXACT = UnitedConfig(
     epsilon=((0.0, 1.0),),
     task_epsilon=((0.0, 1.0),),
     environments=4,
+    start_environments=2,
     task_environments=2,
     reward_scale=0.2,
     decision_cost=0.0,
@@ -289,6 +290,29 @@ def test_every_head_learns_its_exact_table():
         np.testing.assert_allclose(outputs.choices[live] / 0.2, wanted[live], atol=0.15)
         flat = value_iteration(tables, GAMMA).action_values
         np.testing.assert_allclose(outputs.actions[live, 0] / 0.2, flat[live], atol=0.15)
+
+
+def test_some_copies_explore_less_and_some_begin_elsewhere():
+    """What the run tells is of the environment's own copies alone."""
+    config = replace(
+        EXACT, environments=3, ticks_per_round=4, epsilon_spread=1e6, epsilon=((0.0, 0.5),), learning_starts=100_000
+    )
+    algorithm = united(config, CORRIDOR, OPTIONS, Rules(discount=GAMMA, step_limit=10), 100_000)
+    network = init_united_network(LINEAR, "nothing", (LENGTH,), 2, 2, jax.random.key(0))
+    step, visited, begun = jax.jit(algorithm.run_round), [], []
+    for seed in range(2):
+        carry, cells = algorithm.init(jax.random.key(seed), network), []
+        for number in range(60):
+            carry, log = step(carry, jnp.int32(number))
+            cells.append(np.asarray(carry.actors[0].actor.state))
+            elsewhere = carry.actors[1].actor
+            begun.append(np.asarray(elsewhere.state)[np.asarray(elsewhere.deciding)])
+        visited.append(np.stack(cells))
+        assert log.valid.shape == (4 * 3,)
+        assert carry.actors[1].first_action.shape == (2,)
+    assert (visited[0][:, 0] != visited[1][:, 0]).any()
+    np.testing.assert_array_equal(visited[0][:, 1:], visited[1][:, 1:])
+    assert set(np.concatenate(begun)) == set(range(LENGTH - 1))
 
 
 def test_what_does_not_learn_stands_still():
