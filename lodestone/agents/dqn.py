@@ -184,14 +184,14 @@ def dqn(config: DQNConfig, environment: Environment, options: Options, rules: Ru
         learner = learner._replace(replay=add(learner.replay, taken.transition, taken.valid))
 
         bits = jax.random.bits(update_key, (config.updates_per_round, config.batch_size))
-        learner, mean_loss = run_updates(
+        learner, losses = run_updates(
             learner,
             lambda learner, index: update(config, environment, learner, bits[index], learning_rate),
             number - first_learning_round,
             config.updates_per_round,
             config.target_period,
         )
-        log = log_round(taken, mean_loss)
+        log = log_round(taken, jnp.mean(losses))
         return Carry(learner, actors, surplus, key), log
 
     return Algorithm(init, run_round)

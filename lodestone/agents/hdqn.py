@@ -345,10 +345,10 @@ def hdqn(config: HDQNConfig, environment: Environment, goals: Sequence[Task], ru
         def learn(learner: Learner, index: Int[Array, ""]) -> tuple[Learner, Float[Array, ""]]:
             return update(config, environment, goals, rules.discount, learner, bits[index], learning_rate, both)
 
-        learner, mean_loss = run_updates(
+        learner, losses = run_updates(
             learner, learn, number - first_learning_round, config.updates_per_round, config.target_period
         )
-        log = log_round(decisions, mean_loss)
+        log = log_round(decisions, jnp.mean(losses))
         return Carry(learner, actors, remember(carry.outcomes, options, decisions), key), log
 
     return Algorithm(init, run_round)

@@ -27,26 +27,31 @@ from typing import Literal, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray, UInt32
+from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from lodestone.envs.base import (
     Environment,
     example_state,
-    initial_state,
-    inverse_cdf,
-    next_step,
     observation_shape,
 )
-from lodestone.envs.task import Task
+from lodestone.envs.task import Task, begun_at
 from lodestone.errors import InvalidConfig, check_name
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.networks import NetworkConfig
-from lodestone.learning.policies import greedy
-from lodestone.learning.replay import Replay, add, empty_replay, sample
+from lodestone.learning.prioritized import Drawn, PrioritizedReplay, draw, empty_prioritized, remember, renew
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import double_semi_markov_target, semi_markov_target
-from lodestone.learning.united_execution import Step, UnitedActor, explore, start_united_actor, tick
+from lodestone.learning.united_execution import (
+    Step,
+    TaskActor,
+    UnitedActor,
+    explore,
+    start_task_actor,
+    start_united_actor,
+    task_tick,
+    tick,
+)
 from lodestone.learning.united_network import (
     BASIC,
     Shared,
@@ -127,16 +132,26 @@ class UnitedConfig:
     """Scaled error up to which the losses of values are quadratic, and beyond which they are linear."""
     replay_capacity: int = 1_000_000
     """Steps, and decisions, that are remembered; no more memory is taken than the run can fill."""
+    priority: float = 1.0
+    """Exponent of the errors by which steps, and decisions, are drawn from what is remembered; 0 draws all alike."""
+    correction: float = 0.5
+    """Exponent of the factor by which what is drawn more often counts less; 1 undoes the drawing's bias."""
     learning_starts: int = 4000
     """Steps before the first update."""
     target_period: int = 200
     """Updates between two copies of the network to the target network."""
     epsilon: Knots = ((0.05, 1.0), (0.15, 0.1))
     """Over each stage, the probability of a random choice: one of the primitive actions and options, all alike."""
+    epsilon_spread: float = 0.0
+    """How much less some copies of the environment explore than others: the first with probability epsilon, the last
+    with epsilon to the power of 1 + this, those between with powers between (Horgan et al. 2018, section 3)."""
     task_epsilon: Knots = ((0.0, 1.0), (0.4, 0.1))
     """Over each stage, the probability of a random action where an option is trained on its own task."""
     environments: int = 8
     """Copies of the environment, per seed, that the manager acts in."""
+    start_environments: int = 0
+    """Further copies, per seed, that the manager acts in, for every kind of start that the options' own tasks have:
+    their episodes begin there. The run's length does not count their steps, nor those on the options' tasks."""
     task_environments: int = 4
     """Copies of every option's own task, per seed, in which its policy alone acts."""
     task_step_limit: int = 100
@@ -179,7 +194,17 @@ class UnitedConfig:
         ):
             if getattr(self, name) < 1:
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must be at least 1.")
-        for name in ("learning_starts", "policy_weight", "termination_weight", "manager_weight", "decision_cost"):
+        for name in (
+            "learning_starts",
+            "start_environments",
+            "policy_weight",
+            "termination_weight",
+            "manager_weight",
+            "decision_cost",
+            "priority",
+            "correction",
+            "epsilon_spread",
+        ):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise InvalidConfig(f"{name} is {getattr(self, name)}, but must not be negative.")
         for name in ("adam_epsilon", "huber_delta", "max_gradient_norm", "reward_scale", "trunk_gradient"):
@@ -201,47 +226,19 @@ class Learner(NamedTuple):
     network: UnitedNetwork
     target: UnitedNetwork
     adam: optax.ScaleByAdamState
-    steps: Replay[Step]
-    decisions: Replay[Remembered]
-
-
-class TaskActor(NamedTuple):
-    """One environment of an option's own task."""
-
-    state: State
-    steps: Int[Array, ""]
+    steps: PrioritizedReplay[Step]
+    decisions: PrioritizedReplay[Remembered]
 
 
 class Carry(NamedTuple):
     """Everything that one seed carries from round to round."""
 
     learner: Learner
-    actors: UnitedActor
+    actors: tuple[UnitedActor, ...]
+    """In the environment, and begun at each kind of start of the options' tasks."""
     task_actors: tuple[TaskActor, ...]
     """For every option, its environments."""
     key: PRNGKeyArray
-
-
-def task_tick(
-    task: Task,
-    step_limit: int,
-    values: Float[Array, " A"],
-    epsilon: Float[Array, ""],
-    uniform: Float[Array, " 4"],
-    actor: TaskActor,
-) -> tuple[TaskActor, Step]:
-    """One epsilon-greedy step on an option's own task, which begins anew by itself."""
-    every = jnp.ones(values.shape)
-    action = jnp.where(uniform[0] < epsilon, inverse_cdf(every, uniform[1]), greedy(values, every > 0))
-    moved = next_step(task, uniform[2], actor.state, action)
-    over = moved.terminated | (actor.steps + 1 >= step_limit)
-    restart = TaskActor(initial_state(task, uniform[3]), jnp.int32(0))
-    onward = TaskActor(moved.state, actor.steps + 1)
-    return _select(over, restart, onward), Step(actor.state, action, moved.state)
-
-
-def _select(condition: Bool[Array, ""], if_true: State, if_false: State) -> State:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
 
 
 def policy_loss(
@@ -312,6 +309,25 @@ def manager_loss(
     return optax.huber_loss(values[transition.action], jax.lax.stop_gradient(target), delta=config.huber_delta)
 
 
+class Errors(NamedTuple):
+    """How far what was drawn is from what has been learned."""
+
+    steps: Float[Array, "*batch B"]
+    """Root of twice the policies' losses: for one policy, and small errors, the size of its temporal difference."""
+    decisions: Float[Array, "*batch B"]
+    """The same of the manager's; 0 where a decision no longer counts."""
+
+
+class Renewed(NamedTuple):
+    """What one update found."""
+
+    loss: Float[Array, "*batch"]
+    """Per item of a batch."""
+    slots: tuple[Int[Array, "*batch B"], Int[Array, "*batch B"]]
+    """Of the steps and of the decisions that were drawn."""
+    errors: Errors
+
+
 def loss(
     config: UnitedConfig,
     stage: Stage,
@@ -320,13 +336,15 @@ def loss(
     discount: float,
     network: UnitedNetwork,
     target: UnitedNetwork,
-    steps: Step,
-    decisions: Remembered,
-) -> Float[Array, ""]:
-    """Weighted sum of the losses of what learns in this stage, over B steps and B decisions."""
+    steps_drawn: Drawn[Step],
+    decisions_drawn: Drawn[Remembered],
+) -> tuple[Float[Array, ""], Errors]:
+    """Weighted sum of the losses of what learns in this stage, over B steps and B decisions; and their errors."""
     learns = stage.learns
+    steps, decisions = steps_drawn.items, decisions_drawn.items
     observe = jax.vmap(environment.observe)
     size = config.batch_size
+    of_steps, of_decisions = jnp.zeros(size), jnp.zeros(size)
     learned = observe(_concatenate(steps.state, steps.next_state, decisions.transition.obs))
     features = jax.vmap(network.features)(learned)
     if network.trunk is not None:
@@ -352,8 +370,8 @@ def loss(
                 after = follows(after, jax.vmap(target.manager)(seen_next))
                 preferred = follows(preferred, jax.vmap(network.manager)(held))
             of_head = jax.vmap(partial(policy_loss, config, discount))
-            losses = of_head(values[:, head], after, preferred, steps.action, rewards, ends)
-            total += config.policy_weight * jnp.sum(losses)
+            of_steps += of_head(values[:, head], after, preferred, steps.action, rewards, ends)
+        total += config.policy_weight * jnp.sum(steps_drawn.weights * of_steps)
     if "terminations" in learns and options:
         logits = jax.vmap(partial(each_head, network.terminations))(at_next)
         ended = _each(options, lambda task: jax.vmap(task.terminal)(steps.next_state))
@@ -367,8 +385,9 @@ def loss(
         losses = jax.vmap(partial(manager_loss, config))(values, next_values, preferences, transition)
         actions = jax.vmap(partial(each_head, network.policies))(jax.lax.stop_gradient(at_decision))
         would_do = jnp.argmax(jnp.take_along_axis(actions, transition.action[:, None, None], axis=1)[:, 0], axis=-1)
-        total += config.manager_weight * jnp.sum(jnp.where(would_do == decisions.first_action, losses, 0.0))
-    return total
+        of_decisions = jnp.where(would_do == decisions.first_action, losses, 0.0)
+        total += config.manager_weight * jnp.sum(decisions_drawn.weights * of_decisions)
+    return total, Errors(jnp.sqrt(2 * of_steps), jnp.sqrt(2 * of_decisions))
 
 
 def _each(tasks: Sequence[Environment], ask: Callable[[Environment], Array]) -> Num[Array, "B n"]:
@@ -386,21 +405,34 @@ def update(
     options: Sequence[Task],
     discount: float,
     learner: Learner,
-    bits: UInt32[Array, "2 B"],
+    key: PRNGKeyArray,
     learning_rate: Float[Array, ""],
-) -> tuple[Learner, Float[Array, ""]]:
-    """One gradient step on a batch of steps and one of decisions, drawn by random bits; the target network stays.
-
-    Returns the loss per item of a batch, too.
-    """
-    steps, decisions = sample(learner.steps, bits[0]), sample(learner.decisions, bits[1])
-    value, gradient = jax.value_and_grad(partial(loss, config, stage, environment, options, discount))(
-        learner.network, learner.target, steps, decisions
-    )
+) -> tuple[Learner, Renewed]:
+    """One gradient step on a batch of steps and one of decisions; the target network and what is remembered stay."""
+    steps_key, decisions_key = jax.random.split(key)
+    steps = draw(learner.steps, steps_key, config.batch_size, config.priority, config.correction)
+    decisions = draw(learner.decisions, decisions_key, config.batch_size, config.priority, config.correction)
+    of_network = jax.value_and_grad(partial(loss, config, stage, environment, options, discount), has_aux=True)
+    (value, errors), gradient = of_network(learner.network, learner.target, steps, decisions)
     network, adam = adam_step(
         learner.network, gradient, learner.adam, learning_rate, config.adam_epsilon, config.max_gradient_norm
     )
-    return learner._replace(network=network, adam=adam), value / config.batch_size
+    found = Renewed(value / config.batch_size, (steps.slots, decisions.slots), errors)
+    return learner._replace(network=network, adam=adam), found
+
+
+def with_new_errors(stage: Stage, learner: Learner, found: Renewed, learned: Bool[Array, ""]) -> Learner:
+    """What is remembered with the errors of a round's updates, if there were any, where this stage finds such."""
+
+    def renewed(replay: PrioritizedReplay, slots: Int[Array, "U B"], errors: Float[Array, "U B"]) -> PrioritizedReplay:
+        nowhere = jnp.iinfo(slots.dtype).max
+        return renew(replay, jnp.where(learned, slots, nowhere).reshape(-1), errors.reshape(-1))
+
+    if "basic policy" in stage.learns or "option policies" in stage.learns:
+        learner = learner._replace(steps=renewed(learner.steps, found.slots[0], found.errors.steps))
+    if "manager" in stage.learns:
+        learner = learner._replace(decisions=renewed(learner.decisions, found.slots[1], found.errors.decisions))
+    return learner
 
 
 def united(
@@ -421,8 +453,13 @@ def united(
     in_all = sum(stage.share for stage in stages)
     ends = [round(rounds * total / in_all) for total in accumulate(stage.share for stage in stages)]
     starts = [0, *ends[:-1]]
-    seen_per_round = config.ticks_per_round * (config.environments + len(options) * config.task_environments)
+    starts_of_tasks = dict.fromkeys(option.start for option in options) if config.start_environments else {}
+    places = (environment, *(begun_at(environment, start) for start in starts_of_tasks))
+    copies = (config.environments, *[config.start_environments] * len(starts_of_tasks))
+    decided_per_round = config.ticks_per_round * sum(copies)
+    seen_per_round = decided_per_round + config.ticks_per_round * len(options) * config.task_environments
     learning_starts = config.rounds(config.learning_starts)
+    powers = [1 + config.epsilon_spread * jnp.linspace(0.0, 1.0, count) for count in copies]
 
     def init(key: PRNGKeyArray, start: UnitedNetwork | None = None) -> Carry:
         network_key, actor_key, key = jax.random.split(key, 3)
@@ -437,18 +474,25 @@ def united(
             network=start,
             target=start,
             adam=start_adam(start),
-            steps=empty_replay(Step(state, whole, state), _capacity(config.replay_capacity, seen_per_round, rounds)),
-            decisions=empty_replay(
-                Remembered(transition, whole), _capacity(config.replay_capacity, config.steps_per_round, rounds)
+            steps=empty_prioritized(
+                Step(state, whole, state), _capacity(config.replay_capacity, seen_per_round, rounds)
+            ),
+            decisions=empty_prioritized(
+                Remembered(transition, whole), _capacity(config.replay_capacity, decided_per_round, rounds)
             ),
         )
-        keys = jax.random.split(actor_key, (len(options) + 1, max(config.environments, config.task_environments)))
+        actor_keys, task_keys = jax.random.split(actor_key)
         return Carry(
             learner=learner,
-            actors=jax.vmap(partial(start_united_actor, environment))(keys[0, : config.environments]),
+            actors=tuple(
+                jax.vmap(partial(start_united_actor, place))(jax.random.split(place_key, count))
+                for place, count, place_key in zip(
+                    places, copies, jax.random.split(actor_keys, len(places)), strict=True
+                )
+            ),
             task_actors=tuple(
-                jax.vmap(partial(_start_task, option))(keys[position, : config.task_environments])
-                for position, option in enumerate(options, start=1)
+                jax.vmap(partial(start_task_actor, option))(jax.random.split(option_key, config.task_environments))
+                for option, option_key in zip(options, jax.random.split(task_keys, len(options)), strict=True)
             ),
             key=key,
         )
@@ -456,22 +500,28 @@ def united(
     def collect(
         stage: Stage, key: PRNGKeyArray, carry: Carry, epsilon: Float[Array, ""], task_epsilon: Float[Array, ""]
     ) -> tuple[Carry, Decision]:
-        """The round's ticks. Returns the manager's decisions, in order of time, too."""
+        """The round's ticks. Returns the manager's decisions in the environment, in order of time, too."""
         network = carry.learner.network
 
         def act(actors: tuple, tick_key: PRNGKeyArray) -> tuple[tuple, tuple]:
             united_actors, task_actors = actors
-            uniform = jax.random.uniform(tick_key, (config.environments + len(options) * config.task_environments, 4))
-            of_manager = uniform[: config.environments]
-            outputs = jax.vmap(lambda state: network(environment.observe(state)))(united_actors.actor.state)
-            decisions = jax.vmap(explore, in_axes=(0, 0, None, None))(
-                outputs, of_manager[:, :2], epsilon, "manager" in stage.learns
-            )
-            united_actors, ticks = jax.vmap(partial(tick, environment, rules, config.max_option_steps))(
-                outputs, decisions, of_manager[:, 2:], united_actors
-            )
+            key, task_key = jax.random.split(tick_key)
+            next_actors, ticked = [], []
+            keys = jax.random.split(key, len(places))
+            for place, count, power, actor, place_key in zip(places, copies, powers, united_actors, keys, strict=True):
+                uniform = jax.random.uniform(place_key, (count, 4))
+                outputs = jax.vmap(lambda state: network(environment.observe(state)))(actor.actor.state)
+                decisions = jax.vmap(explore, in_axes=(0, 0, 0, None))(
+                    outputs, uniform[:, :2], epsilon**power, "manager" in stage.learns
+                )
+                actor, ticks = jax.vmap(partial(tick, place, rules, config.max_option_steps))(
+                    outputs, decisions, uniform[:, 2:], actor
+                )
+                next_actors.append(actor)
+                ticked.append(ticks)
+            ticks = _concatenate(*ticked)
             stepped, next_task_actors = [ticks.step], []
-            of_tasks = uniform[config.environments :].reshape(len(options), config.task_environments, 4)
+            of_tasks = jax.random.uniform(task_key, (len(options), config.task_environments, 4))
             for position, (option, actor) in enumerate(zip(options, task_actors, strict=True)):
                 head = network.policy(BASIC + 1 + position)
                 values = jax.vmap(lambda state, head=head: head(environment.observe(state)))(actor.state)
@@ -480,22 +530,25 @@ def united(
                 )
                 next_task_actors.append(actor)
                 stepped.append(step)
-            return (united_actors, tuple(next_task_actors)), (ticks, _concatenate(*stepped))
+            return (tuple(next_actors), tuple(next_task_actors)), (ticks, _concatenate(*stepped))
 
         keys = jax.random.split(key, config.ticks_per_round)
         (actors, task_actors), (ticks, stepped) = jax.lax.scan(act, (carry.actors, carry.task_actors), keys)
-        acted = jnp.ones(stepped.action.shape, dtype=bool).at[:, : config.environments].set(ticks.acted)
+        acted = jnp.ones(stepped.action.shape, dtype=bool).at[:, : sum(copies)].set(ticks.acted)
+        of_environment = jax.tree.map(
+            lambda leaf: leaf[:, : config.environments].reshape(-1, *leaf.shape[2:]), ticks.decision
+        )
         flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (ticks, stepped, acted))
         ticks, stepped, acted = flat
         learner = carry.learner._replace(
-            steps=add(carry.learner.steps, stepped, acted),
-            decisions=add(
+            steps=remember(carry.learner.steps, stepped, acted),
+            decisions=remember(
                 carry.learner.decisions,
                 Remembered(ticks.decision.transition, ticks.first_action),
                 ticks.decision.valid,
             ),
         )
-        return carry._replace(learner=learner, actors=actors, task_actors=task_actors), ticks.decision
+        return carry._replace(learner=learner, actors=actors, task_actors=task_actors), of_environment
 
     def run_stage(index: int, carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         stage, start, end = stages[index], starts[index], ends[index]
@@ -510,19 +563,20 @@ def united(
             piecewise_linear(config.task_epsilon, fraction),
         )
         adam = jax.lax.cond(number == start, lambda: start_adam(carry.learner.network), lambda: carry.learner.adam)
-        bits = jax.random.bits(update_key, (config.updates_per_round, 2, config.batch_size))
+        keys = jax.random.split(update_key, config.updates_per_round)
 
-        def learn(learner: Learner, index: Int[Array, ""]) -> tuple[Learner, Float[Array, ""]]:
-            return update(config, stage, environment, options, rules.discount, learner, bits[index], learning_rate)
+        def learn(learner: Learner, index: Int[Array, ""]) -> tuple[Learner, Renewed]:
+            return update(config, stage, environment, options, rules.discount, learner, keys[index], learning_rate)
 
-        learner, mean_loss = run_updates(
+        learner, found = run_updates(
             carry.learner._replace(adam=adam),
             learn,
             number - learning_starts,
             config.updates_per_round,
             config.target_period,
         )
-        log = log_round(decisions, mean_loss)
+        learner = with_new_errors(stage, learner, found, number >= learning_starts)
+        log = log_round(decisions, jnp.mean(found.loss))
         return carry._replace(learner=learner), log
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
@@ -537,7 +591,3 @@ def united(
 def _capacity(most: int, per_round: int, rounds: int) -> int:
     """Never less than a round brings, never more than the run does."""
     return max(per_round, min(most, per_round * rounds))
-
-
-def _start_task(task: Task, key: PRNGKeyArray) -> TaskActor:
-    return TaskActor(initial_state(task, jax.random.uniform(key)), jnp.int32(0))

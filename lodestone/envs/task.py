@@ -102,6 +102,11 @@ def goal(environment: Environment, name: str, holds: Callable[..., Bool[Array, "
     return Task(environment, name, _as_before, holds, Arrival(holds))
 
 
+def begun_at(environment: Environment, start: Callable[..., tuple[Float[Array, " I"], State]]) -> Task:
+    """The environment as it is, but for where its episodes begin."""
+    return Task(environment, "begun elsewhere", start, _as_environment_ends, _as_environment_pays)
+
+
 def endless(environment: Environment) -> Task:
     """The world without its task: an episode begins as before, nothing ends it and nothing is paid."""
     return Task(environment, "endless", _as_before, _never, _nothing)
@@ -109,6 +114,16 @@ def endless(environment: Environment) -> Task:
 
 def _as_before(environment: Environment) -> tuple[Float[Array, " I"], State]:
     return environment.initial_distribution()
+
+
+def _as_environment_ends(environment: Environment, state: State) -> Bool[Array, ""]:
+    return environment.terminal(state)
+
+
+def _as_environment_pays(
+    environment: Environment, state: State, action: Int[Array, ""], next_state: State
+) -> Float[Array, ""]:
+    return environment.reward(state, action, next_state)
 
 
 def _never(environment: Environment, state: State) -> Bool[Array, ""]:

@@ -51,8 +51,8 @@ class Size:
 
 
 _CONFIG = UnitedConfig(
-    network=NetworkConfig(kernels=(3,), strides=(3,), channels=(16,), hidden=(128,)),
-    updates_per_round=4,
+    network=NetworkConfig(kernels=(3,), strides=(3,), channels=(8,), hidden=(256,)),
+    start_environments=8,
 )
 SIZES = (
     Size(
@@ -62,20 +62,21 @@ SIZES = (
         150_000,
         70.0,
     ),
-    # A long phase of many random choices: near the goal the shorter ways are otherwise seldom tried.
+    # The best tower stands two columns away, the next best, a step longer, in the next: all ways have to be known well.
     Size(
         "6x4",
         MagnetArm(rows=6, columns=4, bricks=4, tower_height=4),
         replace(
             _CONFIG,
-            epsilon=((0.15, 1.0), (0.3, 0.4), (0.75, 0.2), (1.0, 0.02)),
-            learning_rate=((0.0, 1e-3), (0.5, 1e-3), (0.65, 3e-4), (0.8, 1e-4), (0.9, 3e-5), (1.0, 1e-5)),
-            learning_starts=20_000,
+            epsilon=((0.1, 1.0), (0.2, 0.5), (0.8, 0.5), (1.0, 0.05)),
+            epsilon_spread=2.0,
+            learning_rate=((0.0, 1e-3), (0.7, 1e-3), (0.85, 3e-4), (0.95, 5e-5), (1.0, 1e-5)),
+            learning_starts=60_000,
             target_period=100,
-            ticks_per_round=4,
-            updates_per_round=6,
+            ticks_per_round=24,
+            updates_per_round=12,
         ),
-        640_000,
+        1_600_000,
         50.0,
     ),
 )

@@ -39,10 +39,15 @@ def add(replay: Replay[Item], batch: Item, valid: Bool[Array, " M"]) -> Replay[I
     return Replay(storage, (replay.cursor + count) % capacity, jnp.minimum(replay.size + count, capacity))
 
 
-def sample(replay: Replay[Item], bits: UInt32[Array, " B"]) -> Item:
-    """B items drawn uniformly with replacement, by random bits; empty ones while there are none.
+def sample_slots(replay: Replay, bits: UInt32[Array, " B"]) -> Int[Array, " B"]:
+    """Where B items are held that are drawn uniformly with replacement, by random bits; 0 while there are none.
 
     The remainder favours no item by more than one part in 2^32 / size.
     """
-    index = (bits % jnp.maximum(replay.size, 1).astype(jnp.uint32)).astype(jnp.int32)
-    return jax.tree.map(lambda leaf: leaf[index], replay.storage)
+    return (bits % jnp.maximum(replay.size, 1).astype(jnp.uint32)).astype(jnp.int32)
+
+
+def sample(replay: Replay[Item], bits: UInt32[Array, " B"]) -> Item:
+    """B items drawn uniformly with replacement, by random bits; empty ones while there are none."""
+    slots = sample_slots(replay, bits)
+    return jax.tree.map(lambda leaf: leaf[slots], replay.storage)

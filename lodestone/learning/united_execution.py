@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, initial_state, next_step
+from lodestone.envs.base import Environment, initial_state, inverse_cdf, next_step
 from lodestone.envs.task import Task
 from lodestone.learning.evaluation import Episode, Trace
+from lodestone.learning.policies import greedy
 from lodestone.learning.united_network import BASIC, Outputs, UnitedNetwork
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Decision, Rules, start_actor
@@ -38,6 +39,13 @@ class UnitedActor(NamedTuple):
     actor: Actor
     first_action: Int[Array, ""]
     """What the running choice began with."""
+
+
+class TaskActor(NamedTuple):
+    """One environment of an option's own task."""
+
+    state: State
+    steps: Int[Array, ""]
 
 
 class Tick(NamedTuple):
@@ -174,6 +182,29 @@ def tick(
     next_first = jnp.where(fresh, action, first_action)
     brought = Tick(settled, first_action, ~over, Step(actor.state, action, moved.state), option, fresh & ~over)
     return UnitedActor(next_actor, next_first), brought
+
+
+def start_task_actor(task: Task, key: PRNGKeyArray) -> TaskActor:
+    """At the beginning of its first episode."""
+    return TaskActor(initial_state(task, jax.random.uniform(key)), jnp.int32(0))
+
+
+def task_tick(
+    task: Task,
+    step_limit: int,
+    values: Float[Array, " A"],
+    epsilon: Float[Array, ""],
+    uniform: Float[Array, " 4"],
+    actor: TaskActor,
+) -> tuple[TaskActor, Step]:
+    """One epsilon-greedy step on an option's own task, which begins anew by itself."""
+    every = jnp.ones(values.shape)
+    action = jnp.where(uniform[0] < epsilon, inverse_cdf(every, uniform[1]), greedy(values, every > 0))
+    moved = next_step(task, uniform[2], actor.state, action)
+    over = moved.terminated | (actor.steps + 1 >= step_limit)
+    restart = TaskActor(initial_state(task, uniform[3]), jnp.int32(0))
+    onward = TaskActor(moved.state, actor.steps + 1)
+    return _select(over, restart, onward), Step(actor.state, action, moved.state)
 
 
 class UnitedOptions(Options):

@@ -26,6 +26,7 @@ from lodestone.agents.united import (
 from lodestone.errors import InvalidConfig, UnknownName
 from lodestone.learning.loop import train
 from lodestone.learning.networks import NetworkConfig
+from lodestone.learning.prioritized import Drawn
 from lodestone.learning.united_execution import Step, UnitedOptions, choices
 from lodestone.learning.united_network import init_united_network, one_head
 from lodestone.options.execution import Rules
@@ -39,7 +40,12 @@ SMALL = NetworkConfig(kernels=(), strides=(), channels=(), hidden=(8,))
 B, GAMMA = 12, 0.9
 
 
-def batch() -> tuple[Step, Remembered]:
+def drawn(items, seed):
+    weights = np.random.default_rng(seed).random(B)
+    return Drawn(items, jnp.arange(B), jnp.asarray(weights, jnp.float32))
+
+
+def batch() -> tuple[Drawn[Step], Drawn[Remembered]]:
     rng = np.random.default_rng(0)
     state, action = rng.integers(0, LENGTH - 1, B), rng.integers(0, 2, B)
     steps = Step(
@@ -57,7 +63,7 @@ def batch() -> tuple[Step, Remembered]:
         next_obs=jnp.asarray(rng.integers(0, LENGTH, B), jnp.int32),
         next_available=jnp.asarray(available),
     )
-    return steps, Remembered(transition, jnp.asarray(rng.integers(0, 2, B), jnp.int32))
+    return drawn(steps, 1), drawn(Remembered(transition, jnp.asarray(rng.integers(0, 2, B), jnp.int32)), 2)
 
 
 def numpy_layers(network, x):
@@ -84,8 +90,9 @@ def huber(error, delta):
 
 
 def numpy_loss(config, stage, network, target, steps, decisions):
-    """Everything one sample and one head at a time."""
+    """Everything one sample and one head at a time. Returns the losses of every step and every decision, too."""
     total, goals = 0.0, (LENGTH - 1, 2, 4)
+    of_steps, of_decisions = np.zeros(B), np.zeros(B)
 
     def best(next_values, preferences, usable):
         usable = np.flatnonzero(usable)
@@ -93,7 +100,7 @@ def numpy_loss(config, stage, network, target, steps, decisions):
         return next_values[usable[np.argmax(chooser[usable])]]
 
     ends = {1: [], 2: []}
-    for state, action, after in zip(*map(np.asarray, steps), strict=True):
+    for index, (state, action, after) in enumerate(zip(*map(np.asarray, steps.items), strict=True)):
         _, values, _ = numpy_outputs(network, state)
         next_choices, next_actions, logits = numpy_outputs(network, after)
         target_choices, target_actions, _ = numpy_outputs(target, after)
@@ -111,7 +118,9 @@ def numpy_loss(config, stage, network, target, steps, decisions):
                 later = best(target_actions[head], next_actions[head], np.ones(2))
             wanted = reward * config.reward_scale + (0 if after == goal else GAMMA * later)
             if part in stage.learns:
-                total += config.policy_weight * huber(values[head, action] - wanted, config.huber_delta)
+                error = huber(values[head, action] - wanted, config.huber_delta)
+                of_steps[index] += error
+                total += config.policy_weight * float(steps.weights[index]) * error
             if head > 0:
                 ended = after == goal
                 entropy = np.log(np.exp(logits[head - 1]).sum()) - logits[head - 1, int(ended)]
@@ -123,7 +132,7 @@ def numpy_loss(config, stage, network, target, steps, decisions):
                 total += config.termination_weight * B / 2 * (np.mean(of_kind) if of_kind else 0.0)
     if "manager" in stage.learns:
         for index in range(B):
-            one = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), decisions)
+            one = jax.tree.map(lambda leaf, index=index: np.asarray(leaf[index]), decisions.items)
             move = one.transition
             values, actions, _ = numpy_outputs(network, move.obs)
             if actions[move.action].argmax() != one.first_action:
@@ -137,8 +146,9 @@ def numpy_loss(config, stage, network, target, steps, decisions):
                 )
                 later *= move.discount
             wanted = (move.reward - config.decision_cost) * config.reward_scale + later
-            total += config.manager_weight * huber(values[move.action] - wanted, config.huber_delta)
-    return total
+            of_decisions[index] = huber(values[move.action] - wanted, config.huber_delta)
+            total += config.manager_weight * float(decisions.weights[index]) * of_decisions[index]
+    return total, of_steps, of_decisions
 
 
 @pytest.mark.parametrize("shared", ["nothing", "hidden"])
@@ -158,10 +168,12 @@ def test_loss_equals_a_plain_numpy_loop(shared, double, stage):
     )
     network, target = (init_united_network(SMALL, shared, (LENGTH,), 2, 2, jax.random.key(number)) for number in (0, 1))
     steps, decisions = batch()
-    found = loss(config, stage, CORRIDOR, OPTIONS, GAMMA, network, target, steps, decisions)
-    wanted = numpy_loss(config, stage, network, target, steps, decisions)
+    found, errors = loss(config, stage, CORRIDOR, OPTIONS, GAMMA, network, target, steps, decisions)
+    wanted, of_steps, of_decisions = numpy_loss(config, stage, network, target, steps, decisions)
     assert wanted > 0.1
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
+    np.testing.assert_allclose(errors.steps, np.sqrt(2 * of_steps), rtol=1e-4)
+    np.testing.assert_allclose(errors.decisions, np.sqrt(2 * of_decisions), rtol=1e-4)
 
 
 def gradient_of(config, stage, options=OPTIONS):
@@ -171,14 +183,13 @@ def gradient_of(config, stage, options=OPTIONS):
     )
     steps, decisions = batch()
     if not options:
+        steps = steps._replace(weights=jnp.ones(B))
         decisions = jax.tree.map(jnp.zeros_like, decisions)
-    return (
-        network,
-        target,
-        jax.grad(lambda network: loss(config, stage, CORRIDOR, options, GAMMA, network, target, steps, decisions))(
-            network
-        ),
-    )
+
+    def total(network):
+        return loss(config, stage, CORRIDOR, options, GAMMA, network, target, steps, decisions)[0]
+
+    return network, target, jax.grad(total)(network)
 
 
 @pytest.mark.parametrize("part", PARTS[1:])
@@ -207,7 +218,7 @@ def test_the_trunk_gets_its_share_of_the_gradient():
 def test_without_options_the_basic_policy_is_dqn():
     config = UnitedConfig(network=SMALL, shared="nothing", batch_size=B, huber_delta=1.0, reward_scale=0.5)
     network, target, gradient = gradient_of(config, Stage(1.0, ("basic policy",)), options=())
-    steps, _ = batch()
+    steps = batch()[0].items
     eye = jnp.eye(LENGTH)
     transitions = Transition(
         obs=eye[steps.state],
@@ -244,6 +255,7 @@ EXACT = UnitedConfig(
     epsilon=((0.0, 1.0),),
     task_epsilon=((0.0, 1.0),),
     environments=4,
+    start_environments=2,
     task_environments=2,
     reward_scale=0.2,
     decision_cost=0.0,
@@ -278,6 +290,29 @@ def test_every_head_learns_its_exact_table():
         np.testing.assert_allclose(outputs.choices[live] / 0.2, wanted[live], atol=0.15)
         flat = value_iteration(tables, GAMMA).action_values
         np.testing.assert_allclose(outputs.actions[live, 0] / 0.2, flat[live], atol=0.15)
+
+
+def test_some_copies_explore_less_and_some_begin_elsewhere():
+    """What the run tells is of the environment's own copies alone."""
+    config = replace(
+        EXACT, environments=3, ticks_per_round=4, epsilon_spread=1e6, epsilon=((0.0, 0.5),), learning_starts=100_000
+    )
+    algorithm = united(config, CORRIDOR, OPTIONS, Rules(discount=GAMMA, step_limit=10), 100_000)
+    network = init_united_network(LINEAR, "nothing", (LENGTH,), 2, 2, jax.random.key(0))
+    step, visited, begun = jax.jit(algorithm.run_round), [], []
+    for seed in range(2):
+        carry, cells = algorithm.init(jax.random.key(seed), network), []
+        for number in range(60):
+            carry, log = step(carry, jnp.int32(number))
+            cells.append(np.asarray(carry.actors[0].actor.state))
+            elsewhere = carry.actors[1].actor
+            begun.append(np.asarray(elsewhere.state)[np.asarray(elsewhere.deciding)])
+        visited.append(np.stack(cells))
+        assert log.valid.shape == (4 * 3,)
+        assert carry.actors[1].first_action.shape == (2,)
+    assert (visited[0][:, 0] != visited[1][:, 0]).any()
+    np.testing.assert_array_equal(visited[0][:, 1:], visited[1][:, 1:])
+    assert set(np.concatenate(begun)) == set(range(LENGTH - 1))
 
 
 def test_what_does_not_learn_stands_still():

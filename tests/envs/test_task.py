@@ -9,9 +9,11 @@ import pytest
 from corridor import Corridor
 
 from lodestone.envs.base import Environment
-from lodestone.envs.magnet_arm import MagnetArm
+from lodestone.envs.magnet_arm import MagnetArm, random_layouts
 from lodestone.envs.state_space import reachable_states
-from lodestone.envs.task import goal, looks
+from lodestone.envs.task import begun_at, goal, looks
+from lodestone.planning.solve import value_iteration
+from lodestone.planning.tables import tabulate
 
 
 @pytest.mark.parametrize("environment", [Corridor(length=5), MagnetArm(rows=3, columns=3, bricks=2, tower_height=2)])
@@ -34,3 +36,14 @@ def test_goals_that_look_alike_are_equal():
     assert one.stop == same.stop
     assert hash(one.stop) == hash(same.stop)
     assert one.stop != other.stop
+
+
+def test_an_environment_that_begins_elsewhere_has_the_same_values():
+    arm = MagnetArm(rows=3, columns=3, bricks=2, tower_height=2)
+    elsewhere = begun_at(arm, random_layouts)
+    jax.tree.map(np.testing.assert_array_equal, elsewhere.initial_distribution(), random_layouts(arm))
+    tables, of_arm = tabulate(elsewhere), tabulate(arm)
+    numbers = np.asarray(jax.vmap(tables.space.index_of)(of_arm.space.states))
+    np.testing.assert_array_equal(tables.terminal[numbers], of_arm.terminal)
+    found, wanted = (value_iteration(one, 0.9).action_values for one in (tables, of_arm))
+    np.testing.assert_allclose(found[numbers], wanted)
