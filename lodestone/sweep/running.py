@@ -1,0 +1,68 @@
+"""Work on many processors or machines, by Ray: each piece in a process that may die, and is then tried again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
+
+from lodestone.errors import InvalidConfig
+
+T = TypeVar("T")
+
+
+def require_ray() -> Any:
+    """The module. Raises `InvalidConfig` where it is not installed."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or it warns that this will be so
+    os.environ.setdefault("RAY_worker_niceness", "0")  # its own choice, 15, starves beside any other work
+    try:
+        import ray
+    except ImportError:
+        raise InvalidConfig("A sweep needs Ray: pip install 'lodestone[cluster]'.") from None
+    return ray
+
+
+def run_all(
+    work: Callable[[T], str | None], pieces: Sequence[T], address: str | None, workers: int | None, retries: int
+) -> Iterator[tuple[T, str | None]]:
+    """Yields each piece when it is over, with the sentence that `work` returned about it.
+
+    On this machine, `workers` at a time, or on the cluster at `address`. A piece whose process dies is begun again, at
+    most `retries` times: `work` has to go on from what it has left on the disk. Raises `InvalidConfig` where no cluster
+    answers. Whoever stops asking ends what is running.
+    """
+    ray = require_ray()
+    try:
+        ray.init(
+            address=address or "local",
+            num_cpus=workers,
+            include_dashboard=None if address else False,
+            log_to_driver=False,
+            logging_level="error",
+        )
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise InvalidConfig(f"Ray cannot be used at {address or 'this machine'}: {_first_line(error)}") from None
+    try:
+        start = ray.remote(num_cpus=1, max_retries=retries)(work).remote
+        waiting = {start(piece): piece for piece in pieces}
+        while waiting:
+            over, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
+            for each in over:
+                piece = waiting.pop(each)
+                try:
+                    yield piece, ray.get(each)
+                except ray.exceptions.WorkerCrashedError:
+                    yield piece, f"its process died {retries + 1} times."
+                except ray.exceptions.RayError as error:
+                    yield piece, _last_line(error)
+    finally:
+        ray.shutdown()
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _last_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
