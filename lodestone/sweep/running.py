@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -34,13 +35,15 @@ def run_all(
     """
     ray = require_ray()
     try:
-        ray.init(
-            address=address or "local",
-            num_cpus=workers,
-            include_dashboard=None if address else False,
-            log_to_driver=False,
-            logging_level="error",
-        )
+        with warnings.catch_warnings():  # JAX warns of a fork, which here another program follows at once
+            warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+            ray.init(
+                address=address or "local",
+                num_cpus=workers,
+                include_dashboard=None if address else False,
+                log_to_driver=False,
+                logging_level="error",
+            )
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise InvalidConfig(f"Ray cannot be used at {address or 'this machine'}: {_first_line(error)}") from None
     try:

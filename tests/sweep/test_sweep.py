@@ -1,0 +1,120 @@
+"""`lodestone sweep`: every trial is the run that `lodestone train` makes, whatever dies meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from lodestone.cli import main
+
+PLAN = """
+agent = "q-learning"
+environment = "two-rooms"
+seeds = 2
+seeds-per-trial = 1
+[train]
+steps = 2000
+checkpoint-every = 0
+[random]
+draws = {draws}
+[random.values]
+learning-rate = [[0, {{low = 0.05, high = 1.0, log = true}}]]
+"""
+HAS_RAY = find_spec("ray") is not None
+needs_ray = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
+
+
+def sweep(plan: Path, out: Path) -> subprocess.Popen[str]:
+    words = [sys.executable, "-m", "lodestone.cli", "sweep", str(plan), "--out", str(out), "--workers", "2", "--json"]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "plan.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.skipif(HAS_RAY, reason="Ray is installed")
+def test_without_ray_a_sentence_says_how_to_get_it(tmp_path, capsys):
+    plan = written(tmp_path, PLAN.format(draws=2))
+    assert main(["sweep", str(plan), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == "lodestone: A sweep needs Ray: pip install 'lodestone[cluster]'.\n"
+    assert not (tmp_path / "out").exists()
+
+
+@needs_ray
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("steps = 2000", "speed = 2000", "speed"),
+        ("steps = 2000", "steps = 0", "steps is 0, but must be at least 1."),
+        ("high = 1.0", "high = 7.0", "learning_rate"),
+        ("q-learning", "magic", "There is no agent named 'magic'"),
+    ],
+)
+def test_a_flag_that_is_refused_is_refused_before_anything_is_written(old, new, sentence, tmp_path, capsys):
+    plan = written(tmp_path, PLAN.format(draws=2).replace(old, new))
+    try:
+        code = main(["sweep", str(plan), "--out", str(tmp_path / "out")])
+    except SystemExit as leaving:
+        code = leaving.code
+    assert code == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@needs_ray
+@pytest.mark.slow
+def test_fifty_trials_of_which_one_loses_its_process_are_those_that_are_trained_alone(tmp_path):
+    plan, out = written(tmp_path, PLAN.format(draws=25)), tmp_path / "out"
+    with sweep(plan, out) as process:
+        while process.poll() is None and len(list(out.glob("trials/*/result.json"))) < 20:
+            time.sleep(0.05)
+        killed = _kill_a_worker(process.pid)
+        printed = process.communicate()[0]
+    assert killed
+    assert process.returncode == 0
+    found = json.loads(printed)
+    assert (found["trials"], found["failed"], len(found["rows"])) == (50, {}, 50)
+    words = json.loads((out / "sweep.json").read_text())["trials"]
+    for number, each in enumerate(words, start=1):
+        alone = tmp_path / "alone" / str(number)
+        assert main(["train", *each, "--out", str(alone), "--json"]) == 0
+        trained = out / "trials" / f"{number:04}"
+        assert (trained / "policy.safetensors").read_bytes() == (alone / "policy.safetensors").read_bytes()
+    assert {"report.html", "results.csv", "results.json", "sweep.png"} <= {path.name for path in out.iterdir()}
+
+    results = {path: path.stat().st_mtime_ns for path in out.glob("trials/*/*")}
+    with sweep(plan, out) as again:
+        assert json.loads(again.communicate()[0])["rows"] == found["rows"]
+    assert {path: path.stat().st_mtime_ns for path in out.glob("trials/*/*")} == results
+    plan.write_text(PLAN.format(draws=24))
+    assert main(["sweep", str(plan), "--out", str(out)]) == 2
+
+
+def _kill_a_worker(driver: int) -> bool:
+    """Kill a process of Ray, of this driver's, that is training."""
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            training = path.joinpath("cmdline").read_bytes().startswith(b"ray::train_trial")
+            if training and _descends(int(path.name), driver):
+                os.kill(int(path.name), signal.SIGKILL)
+                return True
+        except OSError:
+            continue
+    return False
+
+
+def _descends(process: int, ancestor: int) -> bool:
+    while process not in (0, 1, ancestor):
+        process = int(Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[1])
+    return process == ancestor
