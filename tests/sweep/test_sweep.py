@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from lodestone.cli import main
+from lodestone.cli.sweep import Piece
 
 PLAN = """
 agent = "q-learning"
@@ -70,6 +72,52 @@ def test_a_flag_that_is_refused_is_refused_before_anything_is_written(old, new, 
     assert code == 2
     assert sentence in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def here(fail: str | None = None) -> Callable[..., Iterator[tuple[Piece, str | None]]]:
+    """In the place of Ray: one trial after the other in this process; the second fails, or is interrupted."""
+
+    def run_all(work, pieces, *settings):
+        for number, piece in enumerate(pieces):
+            if number == 1 and fail == "interrupt":
+                raise KeyboardInterrupt
+            yield piece, fail if number == 1 and fail else work(piece)
+
+    return run_all
+
+
+def test_a_sweep_is_interrupted_goes_on_and_names_what_failed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lodestone.cli.sweep.require_ray", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    text = PLAN.format(draws=1).replace("steps = 2000", "steps = 300").replace("seeds = 2", "seeds = 3")
+    words = ["sweep", str(written(tmp_path, text)), "--out", "out"]
+    out = tmp_path / "out"
+
+    monkeypatch.setattr("lodestone.cli.sweep.run_all", here("interrupt"))
+    assert main(words) == 130
+    assert capsys.readouterr().err.endswith(f"interrupted; the same command goes on with the sweep in {out}.\n")
+    first = (out / "trials" / "0001" / "policy.safetensors").stat().st_mtime_ns
+
+    monkeypatch.setattr("lodestone.cli.sweep.run_all", here("it fell over."))
+    with pytest.raises(SystemExit, match="1"):
+        main(words)
+    assert "Trial 0003 failed: it fell over.\n" in capsys.readouterr().out
+
+    monkeypatch.setattr("lodestone.cli.sweep.run_all", here())
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (out / "trials" / "0001" / "policy.safetensors").stat().st_mtime_ns == first
+    assert [(row["trial"], row["seed"]) for row in found["rows"]] == [("0001", 0), ("0002", 1), ("0003", 2)]
+    assert all(row["gap"] == row["optimal_return"] - row["greedy_return"] for row in found["rows"])
+    (standing,) = found["configurations"]
+    assert standing["seeds"] == 3
+    assert standing["greedy_return"] == pytest.approx(sum(row["greedy_return"] for row in found["rows"]) / 3)
+    assert (out / "results.csv").read_text().startswith("trial,learning-rate,seed,steps,")
+    assert "learning-rate 0 " in (out / "report.html").read_text()
+
+    (tmp_path / "plan.toml").write_text(text.replace("seeds = 3", "seeds = 2"))
+    assert main(words) == 2
+    assert "holds a sweep of another plan" in capsys.readouterr().err
 
 
 @needs_ray
