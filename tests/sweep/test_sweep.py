@@ -86,6 +86,7 @@ def here(fail: str | None = None) -> Callable[..., Iterator[tuple[Piece, str | N
     return run_all
 
 
+@pytest.mark.slow
 def test_a_sweep_is_interrupted_goes_on_and_names_what_failed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("lodestone.cli.sweep.require_ray", lambda: None)
     monkeypatch.chdir(tmp_path)
