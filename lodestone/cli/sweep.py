@@ -79,9 +79,9 @@ def run(words: list[str]) -> None:
 
 def _sweep(settings: Sweep) -> None:
     plan = read_plan(settings.plan)
-    require_ray()
     for trial in corners(plan):
         run_of(parse_train(list(trial.words)))
+    require_ray()
     folder, every = settings.out.absolute(), trials(plan)
     with lock(prepare_folder(folder) / LOCK):
         _begin(folder, plan, every)
@@ -121,7 +121,7 @@ def _train_all(settings: Sweep, pieces: list[Piece]) -> dict[Path, str]:
             if sentence is not None:
                 failed[piece.folder] = sentence
             done += 1
-            progress.advance(done, f"{done:,} trials over{f', {len(failed):,} failed' if failed else ''}")
+            progress.advance(done, f"{done:,} of {len(pieces):,} over{f', {len(failed):,} failed' if failed else ''}")
     return dict(sorted(failed.items()))
 
 
@@ -154,11 +154,11 @@ def _finish(settings: Sweep, folder: Path, plan: Plan, pieces: list[Piece], fail
         "rows": rows,
         "out": str(folder),
     }
+    write_json(folder / "results.json", content)
     files = ["results.json"]
-    if ranked:
-        files = [*write_report(folder, ranked[:SHOWN], len(ranked), asdict(plan)), "results.csv"]
+    if rows:
         write_csv(folder / "results.csv", rows)
-    write_json(folder / "results.json", content)  # in the place of the page's own numbers
+        files += ["results.csv", *write_report(folder, ranked[:SHOWN], len(ranked), asdict(plan))]
     if settings.json:
         print_json({**content, "files": files})
     else:

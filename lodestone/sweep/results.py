@@ -124,7 +124,10 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def write_report(folder: Path, best: Sequence[Standing], configurations: int, plan: Mapping[str, Any]) -> list[str]:
-    """The page and the picture of `lodestone report`, of the best configurations. Raises `CannotWrite`."""
+    """The picture and the page of `lodestone report`, of the best configurations; returns their names.
+
+    Raises `CannotWrite`.
+    """
     from lodestone.report import runs, studies  # pictures are only needed here
 
     learners = runs.read_learners([folder for each in best for folder in each.folders])
@@ -132,4 +135,7 @@ def write_report(folder: Path, best: Sequence[Standing], configurations: int, pl
     study = runs.study_of([replace(learner, name=names[learner.folders[0]]) for learner in learners])
     shown = f" The {len(best)} best of {configurations} configurations." if len(best) < configurations else ""
     study = replace(study, name="sweep", title="Sweep", summary=f"{study.summary}{shown}")
-    return studies.save_study(folder, study, plan)
+    picture, page = "sweep.png", "report.html"
+    studies.draw_study(study, folder / picture)
+    studies.write_study_report(study, plan, folder / page)
+    return [picture, page]

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from processes import Program
 
 from lodestone.cli import main
 from lodestone.cli.sweep import Piece
@@ -30,13 +31,8 @@ draws = {draws}
 [random.values]
 learning-rate = [[0, {{low = 0.05, high = 1.0, log = true}}]]
 """
+FIFTY = PLAN.format(draws=5).replace("seeds = 2", "seeds = 10")
 HAS_RAY = find_spec("ray") is not None
-needs_ray = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
-
-
-def sweep(plan: Path, out: Path) -> subprocess.Popen[str]:
-    words = [sys.executable, "-m", "lodestone.cli", "sweep", str(plan), "--out", str(out), "--workers", "2", "--json"]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -53,7 +49,6 @@ def test_without_ray_a_sentence_says_how_to_get_it(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@needs_ray
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
@@ -121,46 +116,82 @@ def test_a_sweep_is_interrupted_goes_on_and_names_what_failed(tmp_path, monkeypa
     assert "holds a sweep of another plan" in capsys.readouterr().err
 
 
-@needs_ray
-@pytest.mark.slow
-def test_fifty_trials_of_which_one_loses_its_process_are_those_that_are_trained_alone(tmp_path):
-    plan, out = written(tmp_path, PLAN.format(draws=25)), tmp_path / "out"
-    with sweep(plan, out) as process:
-        while process.poll() is None and len(list(out.glob("trials/*/result.json"))) < 20:
+class Ray:
+    """Sweeps in processes of their own, which share the code that they compile with `Program`."""
+
+    def __init__(self, folder: Path, plan: Path, out: Path) -> None:
+        self._out = out
+        self._words = [sys.executable, "-m", "lodestone.cli", "sweep", str(plan), "--out", str(out), "--json"]
+        self._variables = {
+            **os.environ,
+            "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+            "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+
+    def start(self) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [*self._words, "--workers", "2"],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=self._variables,
+            start_new_session=True,
+        )
+
+    def until(self, finished: int, process: subprocess.Popen[str]) -> None:
+        """Wait for so many trials to be over."""
+        while process.poll() is None and len(self.results()) < finished:
             time.sleep(0.05)
-        killed = _kill_a_worker(process.pid)
-        printed = process.communicate()[0]
-    assert killed
+        assert process.poll() is None
+
+    def results(self) -> dict[Path, int]:
+        """When they were written."""
+        return {path: path.stat().st_mtime_ns for path in self._out.glob("trials/*/result.json")}
+
+
+@pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
+@pytest.mark.slow
+def test_fifty_trials_outlive_a_worker_and_an_interruption(tmp_path):
+    program, plan, out = Program(tmp_path), written(tmp_path, FIFTY), tmp_path / "out"
+    ray = Ray(tmp_path, plan, out)
+
+    with ray.start() as process:
+        ray.until(10, process)
+        _kill_a_worker(process.pid)
+        ray.until(25, process)
+        os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C does
+    assert process.returncode == 130
+    before = ray.results()
+    assert 25 <= len(before) < 50
+
+    with ray.start() as process:
+        found = json.loads(process.communicate()[0])
     assert process.returncode == 0
-    found = json.loads(printed)
-    assert (found["trials"], found["failed"], len(found["rows"])) == (50, {}, 50)
-    words = json.loads((out / "sweep.json").read_text())["trials"]
-    for number, each in enumerate(words, start=1):
-        alone = tmp_path / "alone" / str(number)
-        assert main(["train", *each, "--out", str(alone), "--json"]) == 0
-        trained = out / "trials" / f"{number:04}"
+    assert before.items() <= ray.results().items()
+    assert (found["trials"], found["failed"], len(found["rows"]), len(found["configurations"])) == (50, {}, 50, 5)
+    for number, words in enumerate(json.loads((out / "sweep.json").read_text())["trials"], start=1):
+        alone, trained = tmp_path / "alone" / str(number), out / "trials" / f"{number:04}"
+        assert program.run("train", *words, "--out", str(alone)) == (0, program.printed)
         assert (trained / "policy.safetensors").read_bytes() == (alone / "policy.safetensors").read_bytes()
-    assert {"report.html", "results.csv", "results.json", "sweep.png"} <= {path.name for path in out.iterdir()}
 
-    results = {path: path.stat().st_mtime_ns for path in out.glob("trials/*/*")}
-    with sweep(plan, out) as again:
-        assert json.loads(again.communicate()[0])["rows"] == found["rows"]
-    assert {path: path.stat().st_mtime_ns for path in out.glob("trials/*/*")} == results
-    plan.write_text(PLAN.format(draws=24))
-    assert main(["sweep", str(plan), "--out", str(out)]) == 2
+    after = ray.results()
+    with ray.start() as process:
+        assert json.loads(process.communicate()[0]) == found
+    assert ray.results() == after
 
 
-def _kill_a_worker(driver: int) -> bool:
+def _kill_a_worker(driver: int) -> None:
     """Kill a process of Ray, of this driver's, that is training."""
     for path in Path("/proc").glob("[0-9]*"):
         try:
             training = path.joinpath("cmdline").read_bytes().startswith(b"ray::train_trial")
             if training and _descends(int(path.name), driver):
                 os.kill(int(path.name), signal.SIGKILL)
-                return True
+                return
         except OSError:
             continue
-    return False
+    raise AssertionError("no process is training")
 
 
 def _descends(process: int, ancestor: int) -> bool:
