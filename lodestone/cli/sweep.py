@@ -22,7 +22,6 @@ from lodestone.files import json_safe, lock, prepare_folder, read_json, write_js
 from lodestone.sweep.plan import Plan, Trial, corners, label, read_plan, trials
 from lodestone.sweep.results import (
     RESULT,
-    SHOWN,
     Standing,
     all_rows,
     judge_trial,
@@ -33,6 +32,9 @@ from lodestone.sweep.results import (
 from lodestone.sweep.running import require_ray, run_all
 
 FORMAT, SWEEP, LOCK = 1, "sweep.json", ".lock"
+
+SHOWN = 12
+"""So many configurations are shown on the terminal, the best ones."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def _finish(settings: Sweep, folder: Path, plan: Plan, pieces: list[Piece], fail
         "plan": asdict(plan),
         "trials": len(pieces),
         "failed": {path.name: sentence for path, sentence in failed.items()},
-        "configurations": [each._asdict() for each in ranked],
+        "configurations": [{**each._asdict(), "configuration": dict(each.configuration)} for each in ranked],
         "rows": rows,
         "out": str(folder),
     }
@@ -158,7 +160,7 @@ def _finish(settings: Sweep, folder: Path, plan: Plan, pieces: list[Piece], fail
     files = ["results.json"]
     if rows:
         write_csv(folder / "results.csv", rows)
-        files += ["results.csv", *write_report(folder, ranked[:SHOWN], len(ranked), asdict(plan))]
+        files += ["results.csv", *write_report(folder, plan, ranked)]
     if settings.json:
         print_json({**content, "files": files})
     else:

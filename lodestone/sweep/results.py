@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,14 +16,16 @@ from lodestone.agents.playing import judge_greedily
 from lodestone.agents.run import load_run, read_run
 from lodestone.agents.run_folder import METRICS
 from lodestone.errors import TooManyStates
+from lodestone.experiments.study import NumberTable
 from lodestone.files import read_json, write_atomically, write_json
 from lodestone.planning.solve import optimum
+from lodestone.report.page import number_text
 from lodestone.report.statistics import estimate
-from lodestone.sweep.plan import Configuration, Trial, label
+from lodestone.sweep.plan import Configuration, Plan, Trial, label
 
 RESULT = "result.json"
-SHOWN = 12
-"""So many configurations are shown on the terminal and on the page, the best ones."""
+DRAWN, LISTED = 4, 100
+"""So many configurations, the best ones, have curves on the page, and a line in its table."""
 
 Row = dict[str, Any]
 """What one seed of one trial came to."""
@@ -123,19 +125,40 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
     write_atomically(path, text.getvalue().encode())
 
 
-def write_report(folder: Path, best: Sequence[Standing], configurations: int, plan: Mapping[str, Any]) -> list[str]:
-    """The picture and the page of `lodestone report`, of the best configurations; returns their names.
-
-    Raises `CannotWrite`.
-    """
+def write_report(folder: Path, plan: Plan, ranked: Sequence[Standing]) -> list[str]:
+    """The picture and the page of `lodestone report` about the best configurations, under a table of more of them;
+    returns their names. Raises `CannotWrite`."""
     from lodestone.report import runs, studies  # pictures are only needed here
 
-    learners = runs.read_learners([folder for each in best for folder in each.folders])
-    names = {folder: label(each.configuration, plan["agent"]) for each in best for folder in each.folders}
+    best = ranked[:DRAWN]
+    learners = runs.read_learners([path for each in best for path in each.folders])
+    names = {each.folders[0]: label(each.configuration, plan.agent) for each in best}
     study = runs.study_of([replace(learner, name=names[learner.folders[0]]) for learner in learners])
-    shown = f" The {len(best)} best of {configurations} configurations." if len(best) < configurations else ""
-    study = replace(study, name="sweep", title="Sweep", summary=f"{study.summary}{shown}")
+    study = replace(
+        study,
+        name="sweep",
+        title=f"Sweep: {plan.agent} on {plan.environment}",
+        summary=f"{study.summary}\n\nCurves and episodes are of the {len(best)} best of {len(ranked)} configurations; "
+        "results.csv has every seed of all.",
+        tables=(_ranking(plan, ranked[:LISTED]), *study.tables),
+    )
     picture, page = "sweep.png", "report.html"
     studies.draw_study(study, folder / picture)
-    studies.write_study_report(study, plan, folder / page)
+    studies.write_study_report(study, asdict(plan), folder / page)
     return [picture, page]
+
+
+def _ranking(plan: Plan, ranked: Sequence[Standing]) -> NumberTable:
+    rows = tuple(
+        (
+            label(each.configuration, plan.agent),
+            float(each.seeds),
+            each.greedy_return,
+            f"{number_text(each.low)} to {number_text(each.high)}",
+            "unknown" if each.gap is None else each.gap,
+            each.seconds,
+        )
+        for each in ranked
+    )
+    columns = ("configuration", "seeds", "greedy return", "95 % interval", "median gap to the optimum", "seconds")
+    return NumberTable("Configurations, the best first", columns, rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -10,6 +11,8 @@ from typing import Any, TypeVar
 from lodestone.errors import InvalidConfig
 
 T = TypeVar("T")
+
+SECONDS_TO_ANSWER = 10.0
 
 
 def require_ray() -> Any:
@@ -34,6 +37,8 @@ def run_all(
     answers. Whoever stops asking ends what is running.
     """
     ray = require_ray()
+    if address is not None and ":" in address:
+        _require_answer(address)
     try:
         with warnings.catch_warnings():  # JAX warns of a fork, which here another program follows at once
             warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
@@ -43,9 +48,11 @@ def run_all(
                 include_dashboard=None if address else False,
                 log_to_driver=False,
                 logging_level="error",
+                runtime_env={"env_vars": {"JAX_PLATFORMS": "cpu"}},  # processes that share a GPU run out of its memory
             )
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise InvalidConfig(f"Ray cannot be used at {address or 'this machine'}: {_first_line(error)}") from None
+    except (ImportError, ConnectionError, ValueError, RuntimeError) as error:
+        first = _lines(error)[0].rstrip(".")
+        raise InvalidConfig(f"Ray cannot be used at {address or 'this machine'}: {first}.") from None
     try:
         start = ray.remote(num_cpus=1, max_retries=retries)(work).remote
         waiting = {start(piece): piece for piece in pieces}
@@ -58,14 +65,21 @@ def run_all(
                 except ray.exceptions.WorkerCrashedError:
                     yield piece, f"its process died {retries + 1} times."
                 except ray.exceptions.RayError as error:
-                    yield piece, _last_line(error)
+                    yield piece, _lines(error)[-1]
     finally:
         ray.shutdown()
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+def _require_answer(address: str) -> None:
+    """Ask before Ray does, which waits for minutes. Raises `InvalidConfig`."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=SECONDS_TO_ANSWER).close()
+    except OSError as error:
+        raise InvalidConfig(f"No Ray cluster answers at {address}: {error.strerror or error}.") from None
+    except (ValueError, OverflowError):
+        raise InvalidConfig(f"{address} is no address: it has to be like 192.0.2.1:6379, or auto.") from None
 
 
-def _last_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1]
+def _lines(error: Exception) -> list[str]:
+    return str(error).strip().splitlines() or [type(error).__name__]

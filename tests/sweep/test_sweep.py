@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,6 +18,10 @@ from processes import Program
 
 from lodestone.cli import main
 from lodestone.cli.sweep import Piece
+from lodestone.cli.train import parse_train, run_of
+from lodestone.errors import InvalidConfig
+from lodestone.sweep import running
+from lodestone.sweep.plan import corners, plan_of, trials
 
 PLAN = """
 agent = "q-learning"
@@ -67,6 +72,28 @@ def test_a_flag_that_is_refused_is_refused_before_anything_is_written(old, new, 
     assert code == 2
     assert sentence in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_plan_in_the_docs_can_be_trained():
+    text = Path(__file__).parents[2].joinpath("docs", "sweeps.md").read_text().split("```toml\n")[1].split("```")[0]
+    plan = plan_of(tomllib.loads(text))
+    assert len(trials(plan)) == 80
+    for trial in corners(plan):
+        run_of(parse_train(list(trial.words)))
+
+
+@pytest.mark.parametrize(
+    ("address", "sentence"),
+    [
+        ("127.0.0.1:1", "No Ray cluster answers at 127.0.0.1:1: Connection refused."),
+        ("127.0.0.1:no", "127.0.0.1:no is no address"),
+        ("ray://127.0.0.1:100000", "ray://127.0.0.1:100000 is no address"),
+    ],
+)
+def test_where_no_cluster_answers_nobody_waits(address, sentence, monkeypatch):
+    monkeypatch.setattr(running, "require_ray", lambda: None)
+    with pytest.raises(InvalidConfig, match=sentence):
+        next(running.run_all(lambda piece: None, [1], address, None, 0))
 
 
 def here(fail: str | None = None) -> Callable[..., Iterator[tuple[Piece, str | None]]]:
