@@ -57,15 +57,15 @@ def run_all(
         start = ray.remote(num_cpus=1, max_retries=retries)(work).remote
         waiting = {start(piece): piece for piece in pieces}
         while waiting:
-            over, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
-            for each in over:
-                piece = waiting.pop(each)
-                try:
-                    yield piece, ray.get(each)
-                except ray.exceptions.WorkerCrashedError:
-                    yield piece, f"its process died {retries + 1} times."
-                except ray.exceptions.RayError as error:
-                    yield piece, _lines(error)[-1]
+            (over,), _ = ray.wait(list(waiting))
+            piece = waiting.pop(over)
+            try:
+                sentence = ray.get(over)
+            except ray.exceptions.WorkerCrashedError:
+                sentence = f"its process died {retries + 1} times."
+            except ray.exceptions.RayError as error:
+                sentence = _lines(error)[-1]
+            yield piece, sentence
     finally:
         ray.shutdown()
 

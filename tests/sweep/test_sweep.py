@@ -87,7 +87,7 @@ def test_the_plan_in_the_docs_can_be_trained():
     [
         ("127.0.0.1:1", "No Ray cluster answers at 127.0.0.1:1: Connection refused."),
         ("127.0.0.1:no", "127.0.0.1:no is no address"),
-        ("ray://127.0.0.1:100000", "ray://127.0.0.1:100000 is no address"),
+        (f"127.0.0.1:{10**30}", "is no address"),
     ],
 )
 def test_where_no_cluster_answers_nobody_waits(address, sentence, monkeypatch):
