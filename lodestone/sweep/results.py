@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from lodestone.agents.playing import judge_greedily
 from lodestone.agents.run import load_run, read_run
@@ -89,7 +90,7 @@ def standings(finished: Mapping[Path, Trial]) -> list[Standing]:
 def _standing(configuration: Configuration, folders: Sequence[Path]) -> Standing:
     trials = [read_rows(folder) for folder in folders]
     rows = [row for trial in trials for row in trial]
-    middle, low, high = (float(each) for each in estimate(np.array([row["greedy_return"] for row in rows])))
+    middle, low, high = (float(each) for each in estimate(_greedy_returns(trials)))
     gaps = [row["gap"] for row in rows if row["gap"] is not None]
     return Standing(
         configuration=configuration,
@@ -101,6 +102,10 @@ def _standing(configuration: Configuration, folders: Sequence[Path]) -> Standing
         gap=float(np.median(gaps)) if gaps else None,
         seconds=sum(trial[0]["seconds"] for trial in trials),
     )
+
+
+def _greedy_returns(trials: Iterable[Sequence[Row]]) -> Float[np.ndarray, " S"]:
+    return np.array([row["greedy_return"] for trial in trials for row in trial])
 
 
 def all_rows(finished: Mapping[Path, Trial]) -> list[Row]:
@@ -131,9 +136,12 @@ def write_report(folder: Path, plan: Plan, ranked: Sequence[Standing]) -> list[s
     from lodestone.report import runs, studies  # pictures are only needed here
 
     best = ranked[:DRAWN]
-    learners = runs.read_learners([path for each in best for path in each.folders])
     names = {each.folders[0]: label(each.configuration, plan.agent) for each in best}
-    study = runs.study_of([replace(learner, name=names[learner.folders[0]]) for learner in learners])
+    learners = [
+        replace(learner, name=names[learner.folders[0]], greedy=_greedy_returns(map(read_rows, learner.folders)))
+        for learner in runs.read_learners([path for each in best for path in each.folders])
+    ]
+    study = runs.study_of(learners)
     study = replace(
         study,
         name="sweep",
