@@ -29,7 +29,7 @@ from lodestone.sweep.results import (
     write_csv,
     write_report,
 )
-from lodestone.sweep.running import require_ray, run_all
+from lodestone.sweep.running import require_answer, require_ray, run_all
 
 FORMAT, SWEEP, LOCK = 1, "sweep.json", ".lock"
 
@@ -48,7 +48,7 @@ class Sweep:
     """Folder for the sweep: its trials, results.csv, results.json, report.html. On a cluster all machines have to see
     it at this path."""
     address: str | None = None
-    """Of a running Ray cluster, or auto. Default: this machine."""
+    """Of a running Ray cluster, HOST:PORT, or auto, where this machine belongs to one. Default: this machine."""
     workers: int | None = None
     """Trials trained at a time on this machine. Default: one for each processor."""
     retries: int = 3
@@ -84,6 +84,8 @@ def _sweep(settings: Sweep) -> None:
     for trial in corners(plan):
         run_of(parse_train(list(trial.words)))
     require_ray()
+    if settings.address not in (None, "auto"):
+        require_answer(settings.address)
     folder, every = settings.out.absolute(), trials(plan)
     with lock(prepare_folder(folder) / LOCK):
         _begin(folder, plan, every)

@@ -19,12 +19,24 @@ def require_ray() -> Any:
     """The module. Raises `InvalidConfig` where it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or it warns that this will be so
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # what matters comes as an exception, too
     os.environ.setdefault("RAY_worker_niceness", "0")  # its own choice, 15, starves beside any other work
     try:
         import ray
     except ImportError:
         raise InvalidConfig("A sweep needs Ray: pip install 'lodestone[cluster]'.") from None
     return ray
+
+
+def require_answer(address: str) -> None:
+    """Ask at HOST:PORT before Ray does, which waits for minutes. Raises `InvalidConfig`."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=SECONDS_TO_ANSWER).close()
+    except OSError as error:
+        raise InvalidConfig(f"No Ray cluster answers at {address}: {error.strerror or error}.") from None
+    except (ValueError, OverflowError):
+        raise InvalidConfig(f"{address} is no address: it has to be like 192.0.2.1:6379, or auto.") from None
 
 
 def run_all(
@@ -37,8 +49,6 @@ def run_all(
     answers. Whoever stops asking ends what is running.
     """
     ray = require_ray()
-    if address is not None and ":" in address:
-        _require_answer(address)
     try:
         with warnings.catch_warnings():  # JAX warns of a fork, which here another program follows at once
             warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
@@ -68,17 +78,6 @@ def run_all(
             yield piece, sentence
     finally:
         ray.shutdown()
-
-
-def _require_answer(address: str) -> None:
-    """Ask before Ray does, which waits for minutes. Raises `InvalidConfig`."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    try:
-        socket.create_connection((host, int(port)), timeout=SECONDS_TO_ANSWER).close()
-    except OSError as error:
-        raise InvalidConfig(f"No Ray cluster answers at {address}: {error.strerror or error}.") from None
-    except (ValueError, OverflowError):
-        raise InvalidConfig(f"{address} is no address: it has to be like 192.0.2.1:6379, or auto.") from None
 
 
 def _lines(error: Exception) -> list[str]:

@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 from processes import Program
 
+from lodestone.agents.run import load_run
 from lodestone.cli import main
 from lodestone.cli.sweep import Piece
 from lodestone.cli.train import parse_train, run_of
-from lodestone.errors import InvalidConfig
 from lodestone.sweep import running
 from lodestone.sweep.plan import corners, plan_of, trials
 
@@ -38,6 +39,7 @@ learning-rate = [[0, {{low = 0.05, high = 1.0, log = true}}]]
 """
 FIFTY = PLAN.format(draws=5).replace("seeds = 2", "seeds = 10")
 HAS_RAY = find_spec("ray") is not None
+needs_ray = pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
 
 
 def written(tmp_path: Path, text: str) -> Path:
@@ -88,12 +90,15 @@ def test_the_plan_in_the_docs_can_be_trained():
         ("127.0.0.1:1", "No Ray cluster answers at 127.0.0.1:1: Connection refused."),
         ("127.0.0.1:no", "127.0.0.1:no is no address"),
         (f"127.0.0.1:{10**30}", "is no address"),
+        ("cluster", "cluster is no address: it has to be like 192.0.2.1:6379, or auto."),
     ],
 )
-def test_where_no_cluster_answers_nobody_waits(address, sentence, monkeypatch):
-    monkeypatch.setattr(running, "require_ray", lambda: None)
-    with pytest.raises(InvalidConfig, match=sentence):
-        next(running.run_all(lambda piece: None, [1], address, None, 0))
+def test_where_no_cluster_answers_nothing_is_written(address, sentence, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("lodestone.cli.sweep.require_ray", lambda: None)
+    out = tmp_path / "out"
+    assert main(["sweep", str(written(tmp_path, PLAN.format(draws=2))), "--out", str(out), "--address", address]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()
 
 
 def here(fail: str | None = None) -> Callable[..., Iterator[tuple[Piece, str | None]]]:
@@ -143,6 +148,23 @@ def test_a_sweep_is_interrupted_goes_on_and_names_what_failed(tmp_path, monkeypa
     assert "holds a sweep of another plan" in capsys.readouterr().err
 
 
+@needs_ray
+@pytest.mark.slow
+def test_a_piece_whose_process_dies_is_begun_again(tmp_path):
+    def work(piece: int) -> None:
+        tries = tmp_path / str(piece)
+        with tries.open("a") as file:
+            file.write("x")
+        if piece == 5 or (piece == 3 and tries.stat().st_size == 1):
+            os.kill(os.getpid(), signal.SIGKILL)
+        if piece == 7:
+            raise ValueError("It is seven.")
+
+    over = dict(running.run_all(work, range(10), None, 2, 1))
+    assert over == {**dict.fromkeys(range(10)), 5: "its process died 2 times.", 7: "ValueError: It is seven."}
+    assert [int(path.name) for path in sorted(tmp_path.iterdir()) if path.stat().st_size == 2] == [3, 5]
+
+
 class Ray:
     """Sweeps in processes of their own, which share the code that they compile with `Program`."""
 
@@ -177,7 +199,7 @@ class Ray:
         return {path: path.stat().st_mtime_ns for path in self._out.glob("trials/*/result.json")}
 
 
-@pytest.mark.skipif(not HAS_RAY, reason="Ray is not installed")
+@needs_ray
 @pytest.mark.slow
 def test_fifty_trials_outlive_an_interruption_and_a_worker(tmp_path):
     program, plan, out = Program(tmp_path), written(tmp_path, FIFTY), tmp_path / "out"
@@ -197,10 +219,14 @@ def test_fifty_trials_outlive_an_interruption_and_a_worker(tmp_path):
     assert process.returncode == 0
     assert before.items() <= ray.results().items()
     assert (found["trials"], found["failed"], len(found["rows"]), len(found["configurations"])) == (50, {}, 50, 5)
-    for number, words in enumerate(json.loads((out / "sweep.json").read_text())["trials"], start=1):
-        alone, trained = tmp_path / "alone" / str(number), out / "trials" / f"{number:04}"
-        assert program.run("train", *words, "--out", str(alone)) == (0, program.printed)
-        assert (trained / "policy.safetensors").read_bytes() == (alone / "policy.safetensors").read_bytes()
+    words = json.loads((out / "sweep.json").read_text())["trials"]
+    for first in range(0, 50, 10):  # a configuration's ten seeds, at once and without Ray
+        together = tmp_path / str(first)
+        assert program.run("train", *words[first][:-1], "10", "--out", str(together))[0] == 0
+        trained = [load_run(out / "trials" / f"{first + number:04}") for number in range(1, 11)]
+        np.testing.assert_array_equal(
+            np.concatenate([policy.learned for policy in trained]), load_run(together).learned
+        )
 
     after = ray.results()
     with ray.start() as process:
