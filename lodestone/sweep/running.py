@@ -19,7 +19,6 @@ def require_ray() -> Any:
     """The module. Raises `InvalidConfig` where it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # or it warns that this will be so
-    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # what matters comes as an exception, too
     os.environ.setdefault("RAY_worker_niceness", "0")  # its own choice, 15, starves beside any other work
     try:
         import ray
