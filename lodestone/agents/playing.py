@@ -112,6 +112,12 @@ def episodes_to_judge(policy: AnyPolicy) -> int:
     return 1 if alone and not isinstance(policy, OptionCriticPolicy) else EPISODES
 
 
+def judge_greedily(policy: AnyPolicy) -> Episode:
+    """What every seed's greedy policy reaches: means of `episodes_to_judge` episodes; leaves have an axis for seed."""
+    played = play_many(policy, jax.random.key(0), episodes_to_judge(policy))
+    return jax.tree.map(lambda leaf: leaf.mean(axis=1), played)
+
+
 def _of_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> Episode:
     episode = _play_machines(policy, position, key)
     acts = episode.edge < 0

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.multihost_utils import process_allgather
 from jaxtyping import PyTree
 
 from lodestone.agents.deep_option_critic import DeepOptionCriticConfig, deep_option_critic
@@ -110,7 +111,8 @@ def train_policy(
     turn; it may have been trained on another grid if its shape has `pooling`.
     `on_chunk` gets what happened so far and the fraction of the run that is over, and may end the run by returning
     True. With `checkpoints` the run goes on from the newest one, and writes more; the other arguments must be the same
-    as before.
+    as before. Processes that `jax.distributed` has joined share the seeds: each has to call this alike, and gets all
+    policies.
     Raises `InvalidConfig`, `Diverged`, `TooManyStates`, `NoOptionAvailable`, `EnvironmentFailed`; with `checkpoints`
     `BadFile` and `CannotWrite`, too.
     """
@@ -119,6 +121,8 @@ def train_policy(
         hierarchy = hierarchy or machines(environment)
     if isinstance(config, UnitedConfig | HDQNConfig):
         tasks = _tasks_for(config, environment, tasks)
+    if checkpoints is not None and jax.process_count() > 1:
+        raise InvalidConfig("Several processes that train together keep no checkpoints.")
     if checkpoints is not None and isinstance(environment, OutsideEnvironment):
         raise InvalidConfig("A Gymnasium environment keeps its state to itself, so there can be no checkpoints.")
     given = () if start is None else (_in_turn(start, len(seeds)),)
@@ -143,7 +147,8 @@ def train_policy(
                 break
             if checkpoints is not None and chunk.rounds < plan.rounds:
                 checkpoints.after_chunk(carry, history, chunk.rounds)
-    learned = plan.learned(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(seeds)], plan.of_carry(carry)))
+    every = process_allgather(plan.of_carry(carry), tiled=True)
+    learned = plan.learned(jax.tree.map(lambda leaf: leaf[: len(seeds)], every))
     if isinstance(config, HAMQConfig):
         assert hierarchy is not None
         return MachinePolicy(name, environment, hierarchy, rules, learned, tuple(seeds)), history

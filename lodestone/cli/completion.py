@@ -25,6 +25,7 @@ from lodestone.cli.pretrain import Pretrain
 from lodestone.cli.report import Report
 from lodestone.cli.reproduce import MAGNET_TOWER, Reproduce
 from lodestone.cli.resume import Resume
+from lodestone.cli.sweep import Sweep
 from lodestone.cli.tensorboard import TensorBoard
 from lodestone.cli.train import Train
 from lodestone.cli.watch import Watch
@@ -52,6 +53,7 @@ SETTINGS: dict[str, type] = {
     "reproduce": Reproduce,
     "train": Train,
     "resume": Resume,
+    "sweep": Sweep,
     "pretrain": Pretrain,
     "watch": Watch,
     "report": Report,
@@ -63,7 +65,7 @@ SETTINGS: dict[str, type] = {
 }
 """Every command's settings."""
 
-COMMANDS_OF_FILES = ("resume", "watch", "report", "tensorboard")
+COMMANDS_OF_FILES = ("resume", "sweep", "watch", "report", "tensorboard")
 MANY = 99
 """Words after a flag that takes any number of them."""
 

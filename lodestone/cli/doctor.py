@@ -20,6 +20,7 @@ from lodestone.cli.printing import print_json
 NEEDED = ("jax", "jaxlib", "equinox", "optax", "numpy", "scipy", "gymnasium", "safetensors", "matplotlib", "pillow")
 EXTRAS = {
     "jax-cuda13-plugin": ("training on an NVIDIA GPU", "lodestone[cuda]"),
+    "ray": ("`lodestone sweep`, on this machine or many", "lodestone[cluster]"),
     "pygame": ("pictures of Gymnasium's own environments", "pygame"),
     "minigrid": ("MiniGrid environments, as minigrid:ID", "minigrid"),
     "ale-py": ("Atari environments, as ale_py:ID", "ale-py"),

@@ -1,6 +1,6 @@
 """The program `lodestone`: finds the command and runs it.
 
-Exit codes: 0 done, 2 bad input (one sentence on standard error), 130 interrupted.
+Exit codes: 0 done, 1 some trials of a sweep failed, 2 bad input (one sentence on standard error), 130 interrupted.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from lodestone.cli import (
     report,
     reproduce,
     resume,
+    sweep,
     tensorboard,
     train,
     watch,
@@ -36,6 +37,7 @@ COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "reproduce": reproduce.run,
     "train": train.run,
     "resume": resume.run,
+    "sweep": sweep.run,
     "pretrain": pretrain.run,
     "watch": watch.run,
     "report": report.run,
@@ -55,6 +57,7 @@ commands:
   reproduce                  the paper's two figures, or another experiment: figures, report, numbers
   train AGENT ENVIRONMENT    train an agent ({", ".join(AGENTS)})
   resume RUN                 go on with a training run that was ended early, to the same bits
+  sweep PLAN --out FOLDER    train many configurations on many seeds, on this machine or a Ray cluster
   pretrain ENVIRONMENT       train an environment's options as Q-networks
   watch RUN                  play a saved policy
   report RUN ...             a page about training runs: curves, comparisons, an episode of each

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import jax
 from rich.console import Console
 from rich.table import Table
 
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig, as_configured
-from lodestone.agents.playing import episodes_to_judge, play_many
+from lodestone.agents.playing import episodes_to_judge, judge_greedily
 from lodestone.agents.policies import AnyPolicy
 from lodestone.agents.run import Run, load_start
 from lodestone.agents.run_folder import RunFolder
@@ -76,25 +75,41 @@ class Train(Generic[AgentT, EnvironmentT]):
 
 def run(words: list[str]) -> None:
     """Parse the words after `train` and train."""
+    _train(parse_train(words))
+
+
+def parse_train(words: list[str]) -> Train:
+    """The settings that the words after `train` stand for."""
     agent, rest = take_name("agent", tuple(AGENTS), "train", words)
     name, environment, rest = take_environment(f"train {agent}", rest)
     if issubclass(environment, OutsideEnvironment):  # which has a limit of its own
         rest = ["--decision-limit", "None", *rest]
-    _train(parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest))
+    settings: Train = parse(settings_of(Train, AGENTS[agent], environment), f"train {agent} {name}", rest)
+    return settings
 
 
 def _train(train: Train) -> None:
+    run = run_of(train)
+    if isinstance(train.agent, MAXQConfig):
+        _warn_of_unsafe_abstraction(train.agent, train.environment, train.rules.discount)
+    if train.out is None:
+        _print_result(run, None, *train_run(run, None), train.json)
+        return
+    with RunFolder(train.out) as folder:
+        folder.begin(run)
+        finish(run, folder, train.json)
+
+
+def run_of(train: Train) -> Run:
+    """What is to be trained. Raises what training would raise before it begins."""
     check_seeds(train.seeds)
-    environment, rules = train.environment, train.rules
     options = _choose_options(train)
     start = None if train.from_run is None else load_start(train.from_run)
-    check_training(train.agent, environment, options, rules, start)
-    if isinstance(train.agent, MAXQConfig):
-        _warn_of_unsafe_abstraction(train.agent, environment, rules.discount)
-    run = Run(
+    check_training(train.agent, train.environment, options, train.rules, start)
+    return Run(
         agent=train.agent,
-        environment=environment,
-        rules=rules,
+        environment=train.environment,
+        rules=train.rules,
         options=options,
         steps=train.steps,
         seeds=tuple(range(train.seed, train.seed + train.seeds)),
@@ -102,25 +117,20 @@ def _train(train: Train) -> None:
         from_run=None if train.from_run is None else str(train.from_run),
         checkpoint_every=train.checkpoint_every,
     )
-    if train.out is None:
-        _print_result(run, None, *_train_policy(run, None), train.json)
-        return
-    with RunFolder(train.out) as folder:
-        folder.begin(run)
-        finish(run, folder, train.json)
 
 
 def finish(run: Run, folder: RunFolder, as_json: bool) -> None:
     """Train what is left of a run, save it and print what came of it."""
     try:
-        policy, history = _train_policy(run, folder)
+        policy, history = train_run(run, folder)
         folder.finish(policy)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; `lodestone resume {folder.path}` goes on.") from None
     _print_result(run, folder.path, policy, history, as_json)
 
 
-def _train_policy(run: Run, folder: RunFolder | None) -> tuple[AnyPolicy, History]:
+def train_run(run: Run, folder: RunFolder | None) -> tuple[AnyPolicy, History]:
+    """Train what is left of a run; its folder, where there is one, grows with it."""
     with ConsoleProgress(1.0) as progress, ExitStack() as stack:
         checkpoints = None
         if folder is not None and not isinstance(run.environment, OutsideEnvironment):
@@ -161,8 +171,7 @@ def _print_result(run: Run, out: Path | None, policy: AnyPolicy, history: Histor
         best = optimum(run.environment)
     except TooManyStates:
         best = None
-    judged = episodes_to_judge(policy)
-    greedy = jax.tree.map(lambda leaf: leaf.mean(axis=1), play_many(policy, jax.random.key(0), judged))
+    judged, greedy = episodes_to_judge(policy), judge_greedily(policy)
     content: dict[str, Any] = {
         "agent": run.agent_name,
         "environment": describe_environment(run.environment),

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.multihost_utils import process_allgather
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
 
 from lodestone.errors import Diverged, InvalidConfig
 from lodestone.options.execution import Decision
@@ -96,7 +97,8 @@ def train(
     The carry has a leading seed axis, on which seeds may be repeated after the last, and is valid until the next chunk
     is asked for (its memory is then reused). `start`, with a leading seed axis, is what `algorithm.init` takes beside
     the key; `begun` goes on from the end of a chunk, to the same bits on the same machine. Seeds do not influence one
-    another. Raises `Diverged` when a loss is no longer finite.
+    another. Processes that `jax.distributed` has joined share the seeds: each has to call this alike, holds only its
+    part of the carry, and gets the whole log. Raises `Diverged` when a loss is no longer finite.
     """
     if not seeds:
         raise InvalidConfig("Training needs at least one seed.")
@@ -104,6 +106,10 @@ def train(
         raise InvalidConfig("Training needs at least one decision.")
     rounds_per_chunk = min(rounds, rounds_per_chunk)
 
+    if jax.process_count() > 1 and len(seeds) < jax.device_count():
+        raise InvalidConfig(
+            f"{jax.process_count()} processes with {jax.device_count()} devices together need at least as many seeds."
+        )
     devices = jax.devices()[: len(seeds)]
     positions = np.arange(len(seeds) + -len(seeds) % len(devices)) % len(seeds)  # every device gets equally many
     mesh = Mesh(np.array(devices), ("seeds",))
@@ -113,8 +119,11 @@ def train(
         repeated = jax.jit(partial(jax.tree.map, lambda leaf: leaf[positions]))(tree)
         return jax.device_put(repeated, NamedSharding(mesh, over_seeds))
 
+    def init_from(key_data: UInt32[Array, " D"], *start: PyTree) -> Any:
+        return algorithm.init(jax.random.wrap_key_data(key_data), *start)
+
     spread = partial(jax.shard_map, mesh=mesh, check_vma=False)
-    init = jax.jit(spread(jax.vmap(algorithm.init), in_specs=over_seeds, out_specs=over_seeds))
+    init = jax.jit(spread(jax.vmap(init_from), in_specs=over_seeds, out_specs=over_seeds))
     run_chunk = jax.jit(
         spread(
             jax.vmap(partial(_run_chunk, algorithm, rounds_per_chunk), in_axes=(0, None, None)),
@@ -126,14 +135,14 @@ def train(
 
     started, over = perf_counter(), 0
     if begun is None:
-        carry = init(*place((_keys(seeds), *start)))
+        carry = init(*place((jax.random.key_data(_keys(seeds)), *start)))  # keys themselves stay in their process
     else:
         carry, over, started = place(begun.carry), begun.rounds, started - begun.seconds
         del begun  # what it carried takes as much memory as the run
     for first in range(over, rounds, rounds_per_chunk):
         count = min(rounds_per_chunk, rounds - first)
         carry, log = run_chunk(carry, jnp.int32(first), jnp.int32(count))
-        log = jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[: len(seeds), :count], log)
+        log = jax.tree.map(lambda leaf, count=count: leaf[: len(seeds), :count], process_allgather(log, tiled=True))
         _require_finite(log.loss, seeds)
         yield carry, Chunk(log, first + count, perf_counter() - started)
 
