@@ -16,17 +16,21 @@ from lodestone.agents.united import (
     JOINT,
     PARTS,
     SEQUENTIAL,
+    Errors,
+    Learner,
     Remembered,
+    Renewed,
     Stage,
     UnitedConfig,
     loss,
     termination_loss,
     united,
+    with_new_errors,
 )
 from lodestone.errors import InvalidConfig, UnknownName
 from lodestone.learning.loop import train
 from lodestone.learning.networks import NetworkConfig
-from lodestone.learning.prioritized import Drawn
+from lodestone.learning.prioritized import LEAST_ERROR, Drawn, empty_prioritized, remember
 from lodestone.learning.united_execution import Step, UnitedOptions, choices
 from lodestone.learning.united_network import init_united_network, one_head
 from lodestone.options.execution import Rules
@@ -313,6 +317,25 @@ def test_some_copies_explore_less_and_some_begin_elsewhere():
     assert (visited[0][:, 0] != visited[1][:, 0]).any()
     np.testing.assert_array_equal(visited[0][:, 1:], visited[1][:, 1:])
     assert set(np.concatenate(begun)) == set(range(LENGTH - 1))
+
+
+@pytest.mark.parametrize(
+    ("learns", "learned", "steps", "decisions"),
+    [
+        (("option policies", "manager"), True, [0.0, 2.0], [0.0, 3.0]),
+        (("option policies", "manager"), False, [1.0, 1.0], [1.0, 1.0]),
+        (("basic policy",), True, [0.0, 2.0], [1.0, 1.0]),
+        (("terminations",), True, [1.0, 1.0], [1.0, 1.0]),
+    ],
+)
+def test_what_was_learned_from_gets_a_new_error(learns, learned, steps, decisions):
+    replay = remember(empty_prioritized(jnp.int32(0), 2), jnp.arange(2, dtype=jnp.int32), jnp.ones(2, bool))
+    learner = Learner(None, None, None, replay, replay)
+    slots, errors = jnp.array([[0], [1]]), Errors(jnp.array([[0.0], [2.0]]), jnp.array([[0.0], [3.0]]))
+    found = Renewed(jnp.zeros(2), (slots, slots), errors)
+    after = with_new_errors(Stage(1.0, learns), learner, found, jnp.bool_(learned))
+    for found_errors, wanted in ((after.steps, steps), (after.decisions, decisions)):
+        np.testing.assert_allclose(found_errors.ring.storage.error, wanted, atol=LEAST_ERROR)
 
 
 def test_what_does_not_learn_stands_still():
