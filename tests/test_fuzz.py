@@ -22,7 +22,21 @@ import pytest
 
 from lodestone.agents import training
 from lodestone.agents.training import AGENTS
-from lodestone.cli import discover, doctor, main, plan, pretrain, report, reproduce, resume, train, watch
+from lodestone.cli import (
+    completion,
+    discover,
+    doctor,
+    main,
+    plan,
+    pretrain,
+    report,
+    reproduce,
+    resume,
+    sweep,
+    tensorboard,
+    train,
+    watch,
+)
 from lodestone.cli.program import COMMANDS
 from lodestone.discovery.catalogue import METHODS
 from lodestone.envs.registry import ENVIRONMENTS, environment_class
@@ -119,6 +133,8 @@ PLACES = (
     *("folder", "file", "file/a", "loop", "loop/a", "pipe", "gone", "new", "new/a", "a.gif", "a.png", "a.html"),
     *("a.safetensors", "file.safetensors", "y" * 300 + ".safetensors", "folder/a.safetensors", "loop.safetensors"),
 )
+PLAN = "plan.toml"
+"""A good plan of a sweep."""
 NAMES = (*COMMANDS, *AGENTS, *ENVIRONMENTS, *METHODS, *EXPERIMENTS, "CartPole-v1", "os:system", "moon-v0", "lift")
 BY_TYPE = {
     "int": INTEGERS,
@@ -162,7 +178,10 @@ def command_line(chance: random.Random) -> list[str]:
         "watch": ([chance.choice(PLACES)], flags(watch.Watch)),
         "resume": ([chance.choice(PLACES)], flags(resume.Resume)),
         "report": (chance.choices(PLACES, k=chance.randint(0, 2)), flags(report.Report)),
+        "sweep": ([chance.choice((*PLACES, PLAN, PLAN)), "--out", "new"], flags(sweep.Sweep)),
+        "tensorboard": (chance.choices(PLACES, k=chance.randint(0, 2)), flags(tensorboard.TensorBoard)),
         "doctor": ([], flags(doctor.Doctor)),
+        "completion": ([chance.choice(("bash", "zsh", "fish", "csh"))], flags(completion.Completion)),
     }[command]
     words = [command, *words]
     for _ in range(chance.randint(0, 3)):
@@ -183,6 +202,7 @@ def places(tmp_path, monkeypatch) -> Path:
     (tmp_path / "folder" / "a.safetensors").mkdir(parents=True)
     for name in ("file", "file.safetensors"):
         (tmp_path / name).write_text("mine")
+    (tmp_path / PLAN).write_text('agent = "q-learning"\nenvironment = "chain"\n[grid]\ndecision-limit = [5, 9]\n')
     for name in ("loop", "loop.safetensors"):
         (tmp_path / name).symlink_to(name)
     (tmp_path / "gone").symlink_to("nowhere")
@@ -202,6 +222,7 @@ def rest(monkeypatch: pytest.MonkeyPatch) -> None:
         (plan, "optimum"),
         (watch, "record"),
         (doctor, "_look"),
+        (sweep, "require_ray"),
         (runs, "play_many"),
         (studies, "save_study"),
     ):
