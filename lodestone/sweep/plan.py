@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lodestone.errors import BadFile, InvalidConfig
+from lodestone.files import read_file
 
 MOST_TRIALS = 100_000
 OF_THE_SWEEP = ("out", "seed", "seeds", "json", "help")
@@ -60,10 +61,9 @@ class Trial(NamedTuple):
 
 def read_plan(path: Path) -> Plan:
     """Raises `BadFile`, and `InvalidConfig` for what is no plan."""
+    text = read_file(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BadFile(f"{path} cannot be read: {error.strerror or error}.") from None
+        content = tomllib.loads(text.decode())
     except (ValueError, RecursionError) as error:
         raise BadFile(f"{path} is no TOML file: {str(error).rstrip('.')}.") from None
     return plan_of(content)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import tomllib
+from pathlib import Path
 
 import pytest
 
@@ -136,6 +137,8 @@ def test_a_file_that_is_no_plan(tmp_path):
     with pytest.raises(BadFile, match="cannot be read"):
         read_plan(path)
     path.write_bytes(b"\xff\x00")
+    with pytest.raises(BadFile, match="^/dev/full cannot be read: it is no file"):
+        read_plan(Path("/dev/full"))
     with pytest.raises(BadFile, match="is no TOML file"):
         read_plan(path)
 
