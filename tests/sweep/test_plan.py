@@ -137,7 +137,7 @@ def test_a_file_that_is_no_plan(tmp_path):
     with pytest.raises(BadFile, match="cannot be read"):
         read_plan(path)
     path.write_bytes(b"\xff\x00")
-    with pytest.raises(BadFile, match="^/dev/full cannot be read: it is no file"):
+    with pytest.raises(BadFile, match="/dev/full cannot be read: it is no file"):
         read_plan(Path("/dev/full"))
     with pytest.raises(BadFile, match="is no TOML file"):
         read_plan(path)
