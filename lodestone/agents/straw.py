@@ -6,11 +6,11 @@ round N environments take L steps each, and then one gradient step is taken on t
 
     L_t = - log pi(a_t) Adv_t - eta H(pi) + (weight / 2) (G_t - V_t)^2 + alpha g_t KL_t + lambda c^t[0]
 
-where pi = softmax(A^t[:, 0]), V_t is the last row of the same column, g_t says whether step t planned anew, KL_t is the
-divergence of STRAWe's noisy code, c^t[0] the probability of planning anew at the next step, and G_t the lambda-return.
-Adv_t is G_t - V_t without a gradient. The gradient runs back through the plans of the L steps to the round's first
-one, which is taken as it was left. The draws of g_t are those of the steps that were taken, and pass the gradient
-straight through.
+where pi = softmax(A^t[:, 0]) over the actions that are allowed, V_t is the last row of the same column, g_t says
+whether step t planned anew, KL_t is the divergence of STRAWe's noisy code, c^t[0] the probability of planning anew at
+the next step, and G_t the lambda-return. Adv_t is G_t - V_t without a gradient. The gradient runs back through the
+plans of the L steps to the round's first one, which is taken as it was left. The draws of g_t are those of the steps
+that were taken, and pass the gradient straight through.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, OutsideEnvironment, observation_shape
+from lodestone.envs.base import Environment, allowed_actions, observation_shape
 from lodestone.errors import InvalidConfig
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
@@ -33,6 +33,7 @@ from lodestone.learning.networks import NetworkConfig
 from lodestone.learning.plan_execution import Planned, PlanningActor, plan_tick, start_planning
 from lodestone.learning.plan_network import Plan, PlanConfig, PlanNetwork, init_plan_network
 from lodestone.learning.plans import shift
+from lodestone.learning.policies import forbid
 from lodestone.learning.returns import lambda_returns
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.execution import REWARD_SWITCHES, Chance, Decision, Rules
@@ -105,6 +106,7 @@ class Taken(NamedTuple):
     """L steps that one environment took, in order."""
 
     seen: Observation
+    allowed: Bool[Array, "L A"]
     anew: Bool[Array, " L"]
     """Whether the step planned anew, as it was drawn."""
     noise: Float[Array, "L D"]
@@ -144,33 +146,37 @@ class Told(NamedTuple):
     """c^t[0]."""
 
 
+def value_anew(network: PlanNetwork, sharpness: Float[Array, ""], plan: Plan, seen: Observation) -> Float[Array, ""]:
+    """What the step after a plan is worth, by a plan made there: where the story breaks off, no other one follows."""
+    added, _, _ = network.renew(network.trunk(seen), plan, jnp.zeros(network.noise_size), sharpness)
+    return shift(plan.logits)[-1, 0] + added[-1, 0]
+
+
 def retell(network: PlanNetwork, sharpness: Float[Array, ""], decay: float, plan: Plan, taken: Taken) -> Told:
     """One environment's L steps once more, to differentiate: with their actions, draws and noise, from the plan that
     the steps before had left."""
-    features, ahead = (jax.vmap(network.trunk)(seen) for seen in (taken.seen, taken.led_to))
 
-    def step(plan: Plan, now: tuple) -> tuple[Plan, tuple]:
-        features, ahead, anew, noise, cut = now
+    def step(plan: Plan, now: tuple) -> tuple[Plan, tuple[Plan, Array]]:
+        features, anew, noise, cut = now
         plan, apart = network.step(features, plan, anew, noise, sharpness)
-        # What the end of the story is worth: by a plan made where it led to.
-        added, _, _ = network.renew(ahead, plan, jnp.zeros_like(noise), sharpness)
-        onward = shift(plan.logits)[-1, 0] + added[-1, 0]
         left = jax.tree.map(lambda new, old: jnp.where(cut, new, old), network.start(), plan)
-        return left, (plan.logits[:, 0], plan.commitment[0], apart, onward)
+        return left, (plan, apart)
 
-    steps = (features, ahead, taken.anew, taken.noise, taken.cut)
-    _, (columns, commitment, apart, onward) = jax.lax.scan(step, plan, steps)
+    features = jax.vmap(network.trunk)(taken.seen)
+    _, (plans, apart) = jax.lax.scan(step, plan, (features, taken.anew, taken.noise, taken.cut))
+    columns = plans.logits[:, :, 0]
     value = columns[:, -1]
+    onward = jax.vmap(partial(value_anew, network, sharpness))(plans, taken.led_to)
     next_value = jnp.where(taken.cut, onward, jnp.append(value[1:], onward[-1]))
     target = lambda_returns(taken.reward, taken.discount, next_value, taken.cut, decay)
-    log_probs = jax.nn.log_softmax(columns[:, :-1])
+    log_probs = jax.nn.log_softmax(forbid(columns[:, :-1], taken.allowed))
     return Told(
         log_prob=jnp.take_along_axis(log_probs, taken.action[:, None], axis=1)[:, 0],
         entropy=-jnp.sum(jnp.exp(log_probs) * log_probs, axis=1),
         value=value,
         target=jax.lax.stop_gradient(target),
         apart=apart,
-        commitment=commitment,
+        commitment=plans.commitment[:, 0],
     )
 
 
@@ -210,13 +216,14 @@ def collect(
     ) -> tuple[PlanningActor, Decision, Taken]:
         """One step of one environment."""
         state, anew = planning.actor.state, planning.actor.deciding
-        seen = environment.observe(state)
+        seen, allowed = environment.observe(state), allowed_actions(environment, state)
         plan = network.act(seen, planning.plan, anew, noise, sharpness)
-        options = Planned(jax.nn.softmax(plan.logits[:-1, 0]), plan.commitment[0])
+        options = Planned(jax.nn.softmax(forbid(plan.logits[:-1, 0], allowed)), plan.commitment[0])
         after, decision = plan_tick(environment, rules, network, chance, planning, options, plan)
         led_to = decision.transition.next_obs
         taken = Taken(
             seen=seen,
+            allowed=allowed,
             anew=anew,
             noise=noise,
             action=decision.action,
@@ -241,10 +248,8 @@ def straw(config: StrawConfig, environment: Environment, rules: Rules, steps: in
     """The algorithm for the training loop. `steps`, the run's length, is what schedules are fractions of.
 
     Raises `InvalidConfig` for rules under which an option's reward is not the discounted sum of its steps' rewards or a
-    limit is an end, and for environments outside the program, whose allowed actions a plan cannot know.
+    limit is an end.
     """
-    if isinstance(environment, OutsideEnvironment):
-        raise InvalidConfig("STRAW plans steps ahead of what may be done there: it takes no Gymnasium environment.")
     why = "STRAW takes each step's reward as it comes and a limit for no end"
     rules.refuse((*REWARD_SWITCHES, "bootstrap_at_limit"), why)
     rounds = config.rounds(steps)

@@ -13,15 +13,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Num, PRNGKeyArray
 
-from lodestone.envs.base import Environment, OutsideEnvironment, example_state
+from lodestone.envs.base import Environment, allowed_actions, example_state
 from lodestone.envs.state_space import reachable_states
 from lodestone.learning.networks import Linear, NetworkConfig, Trunk, build_layers, draw_weights, weight_shapes
+from lodestone.learning.policies import forbid
 from lodestone.options.base import NO_CAP, Options
 from lodestone.options.soft import numbered_names
 from lodestone.types import State
-
-FORBIDDEN = -1e9
-"""Preference for an action that is not allowed: none, but a number, as probability times logarithm has to be one."""
 
 
 class OptionNetwork(eqx.Module):
@@ -117,6 +115,4 @@ class SoftNetworkOptions(Options):
     def log_probs(self, state: State, features: Float[Array, " F"]) -> Float[Array, "O A"]:
         """Logarithms of the actions' probabilities under each option."""
         theta = self.network.theta(features) / self.temperature
-        if isinstance(self.environment, OutsideEnvironment):
-            theta = jnp.where(self.environment.allowed(state)[None], theta, FORBIDDEN)
-        return jax.nn.log_softmax(theta)
+        return jax.nn.log_softmax(forbid(theta, allowed_actions(self.environment, state)))

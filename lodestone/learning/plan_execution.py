@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment
+from lodestone.envs.base import Environment, allowed_actions
 from lodestone.learning.evaluation import Episode
 from lodestone.learning.plan_network import Plan, PlanNetwork
+from lodestone.learning.policies import greedy
 from lodestone.options.base import NO_CAP, Options
 from lodestone.options.execution import Actor, Chance, Decision, Rules, draw_chance, start_actor, tick
 from lodestone.types import State
@@ -105,7 +106,7 @@ def greedy_tick(
     state, before = planning.actor.state, planning.plan.commitment[0]
     anew = planning.actor.deciding
     plan = network.act(environment.observe(state), planning.plan, anew, jnp.zeros(network.noise_size), jnp.float32(1))
-    best = jax.nn.one_hot(jnp.argmax(plan.logits[:-1, 0]), environment.num_actions)
+    best = jax.nn.one_hot(greedy(plan.logits[:-1, 0], allowed_actions(environment, state)), environment.num_actions)
     options = Planned(best, (plan.commitment[0] >= NEXT_PLAN).astype(jnp.float32))
     after, decision = plan_tick(environment, rules, network, draw_chance(key), planning, options, plan)
     reward = decision.episode_return - planning.actor.episode_return

@@ -16,6 +16,12 @@ def mask_unavailable(values: Float[Array, " O"], available: Bool[Array, " O"]) -
     return jnp.where(available, values, -jnp.inf)
 
 
+def forbid(preferences: Float[Array, "*O A"], allowed: Bool[Array, " A"]) -> Float[Array, "*O A"]:
+    """Preferences whose softmax leaves actions that are not allowed no probability: a number still, not minus infinity,
+    as probability times logarithm has to be one."""
+    return jnp.where(allowed, preferences, -1e9)
+
+
 def greedy(values: Float[Array, " O"], available: Bool[Array, " O"]) -> Int[Array, ""]:
     """The first best available option: reproducible, for evaluation."""
     return jnp.argmax(mask_unavailable(values, available)).astype(jnp.int32)

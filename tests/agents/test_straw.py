@@ -146,7 +146,8 @@ def numpy_loss(one, plan, taken, entropy_weight):
             logits, commitment, apart = numpy_step(one, steps.seen[t], now, steps.anew[t], steps.noise[t], 0.7)
             now = Plan(logits, commitment)
             looked, _, _ = numpy_step(one, steps.led_to[t], now, True, np.zeros(8), 0.7)
-            probs = np.exp(logits[:2, 0]) / np.exp(logits[:2, 0]).sum()
+            probs = np.exp(logits[:2, 0]) * steps.allowed[t]
+            probs /= probs.sum()
             rows.append((probs, logits[2, 0], looked[2, 0], apart, commitment[0]))
             if steps.cut[t]:
                 now = Plan(np.zeros((3, 4)), np.ones(4))
@@ -162,7 +163,7 @@ def numpy_loss(one, plan, taken, entropy_weight):
     total = 0.0
     for (probs, _, _, apart, c, _, action), wrong in zip(everything, missed, strict=True):
         total -= np.log(probs[action]) * wrong
-        total += entropy_weight * (probs * np.log(probs)).sum()
+        total += entropy_weight * sum(p * np.log(p) for p in probs if p > 0)
         total += CONFIG.value_weight / 2 * wrong**2 + CONFIG.noise_cost * apart + 0.3 * c
     return total / len(everything)
 
@@ -180,6 +181,17 @@ def test_loss_equals_a_plain_numpy_loop(rules):
     other = jax.tree.map(lambda leaf: 0.9 * leaf, network())
     found = told_loss(other, before.plan, taken)
     np.testing.assert_allclose(found, numpy_loss(other, before.plan, taken, 0.05), rtol=2e-4)
+
+
+def test_the_loss_is_about_what_is_allowed():
+    """Where every second step left no choice, its action had probability 1 and no entropy."""
+    before, _, (_, taken) = collected(RULES)
+    only = np.eye(2, dtype=bool)[taken.action]
+    forced = taken._replace(allowed=np.where((np.arange(CONFIG.rollout) % 2 == 0)[:, None, None], only, True))
+    other = jax.tree.map(lambda leaf: 0.9 * leaf, network())
+    found = told_loss(other, before.plan, forced)
+    np.testing.assert_allclose(found, numpy_loss(other, before.plan, forced, 0.05), rtol=2e-4)
+    assert abs(float(found - told_loss(other, before.plan, taken))) > 1e-3
 
 
 def test_a_limit_bootstraps_and_an_end_does_not():

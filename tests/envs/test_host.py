@@ -17,6 +17,7 @@ from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.playing import play_many
 from lodestone.agents.policies import Policy
 from lodestone.agents.saved import load_policy, save_policy
+from lodestone.agents.straw import StrawConfig
 from lodestone.agents.training import train_policy
 from lodestone.envs.host import FromFunction, HostEnvironment, Registered, visit
 from lodestone.envs.registry import make_environment
@@ -182,6 +183,18 @@ def test_option_critic_takes_what_is_allowed(walk):
     found = [len(history.episodes(seed).total_reward) for seed in range(2)]
     assert sorted(found) == sorted(ends)
     assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
+
+
+def test_plans_take_what_is_allowed(walk):
+    """In training, greedily and where they are watched; the walk's numbers go up as soon as anything is learned."""
+    config = StrawConfig(network=SMALL.network, environments=3, rollout=8)
+    policy, history = train_policy(config, walk, primitives(walk), Rules(discount=0.5), 3000, [0, 1])
+    assert len(LOG) == 2 * config.rounds(3000) * config.steps_per_round
+    assert any(one[1] == 0 for one in LOG)
+    assert any(one[5] for one in LOG), "no episode was cut"
+    found = [len(history.episodes(seed).total_reward) for seed in range(2)]
+    assert sum(found) == sum(one[4] or one[5] for one in LOG)
+    assert play_many(policy, jax.random.key(0), 5).success.all()
 
 
 def test_what_the_environment_raises_is_told(walk):
