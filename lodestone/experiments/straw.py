@@ -54,11 +54,12 @@ BRANCH = 3
 """The place where a symbol is seen that could not be known."""
 
 MAZE, MAZE_RULES = GoalMaze(observation="planes"), Rules(discount=0.97, step_limit=50)
-MAZE_STEPS = 600_000
+MAZE_STEPS = 1_200_000
 PLANNING, EVERY_STEP = "STRAW", "STRAW, a new plan at every step"
 _MAZE_CONFIG = StrawConfig(
     network=NetworkConfig(kernels=(), strides=(), channels=(), hidden=(64,)),
-    learning_rate=((0.0, 2e-3), (0.7, 2e-3), (1.0, 1e-4)),
+    commitment_cost=((0.0, 0.0), (0.4, 0.0), (0.6, 0.06)),
+    learning_rate=((0.0, 2e-3), (0.6, 2e-3), (1.0, 1e-4)),
     reward_scale=0.1,
 )
 MAZE_CONFIGS: dict[str, StrawConfig] = {
