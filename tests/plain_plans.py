@@ -48,7 +48,7 @@ def numpy_step(one, seen, plan, anew, noise, sharpness):
         mean, log_variance = both[: len(code)], np.clip(both[len(code) :], -5, 5)
         apart = sum(0.5 * (m**2 + np.exp(v) - 1 - v) for m, v in zip(mean, log_variance, strict=True))
         code = mean + np.exp(log_variance / 2) * np.asarray(noise, np.float64)
-    patch = numpy_linear(one.patch, code).reshape(rows, shape.patch)
+    patch = numpy_linear(one.patch, np.concatenate([code, z])).reshape(rows, shape.patch)
     for row in range(rows):
         for column in range(columns):
             shifted[row, column] += sum(patch[row, k] * filters[k, column] for k in range(shape.patch))

@@ -75,7 +75,7 @@ class PlanNetwork(eqx.Module):
     noise: Linear | None
     """xi -> mean and log of the variance of the noisy code; None where there is no noise."""
     patch: Linear
-    """Code -> the patch."""
+    """Code and z -> the patch. (By the bounded code alone, as in the paper, rare rewards were learned far later.)"""
     schedule: Linear
     """Focus and code -> when to plan anew."""
     shape: PlanConfig = eqx.field(static=True)
@@ -108,7 +108,7 @@ class PlanNetwork(eqx.Module):
         if self.noise is not None:
             mean, log_variance = jnp.split(self.noise(code), 2)
             code, apart = perturb(mean, log_variance, noise), divergence(mean, log_variance)
-        added = write(self.patch(code).reshape(self.rows, self.shape.patch), filters)
+        added = write(self.patch(jnp.concatenate([code, features])).reshape(self.rows, self.shape.patch), filters)
         when = self.schedule(jnp.concatenate([focus, code]))
         return added, commitment(when, self.shape.horizon, self.shape.peak, self.shape.background, sharpness), apart
 
@@ -168,7 +168,7 @@ def init_plan_network(
         (size, 3),
         (patch_size + size, size),
         (size, size),
-        (size, patch_size),
+        (2 * size, patch_size),
         (size + 3, 2),
     ]
     if shape.noisy:

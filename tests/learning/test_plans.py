@@ -87,7 +87,8 @@ def test_then_a_new_plan_is_the_old_one_plus_the_patch():
     plan, seen = some_plan(), some(SEEN, seed=1)
     z = sharp.trunk(seen)
     code = jnp.concatenate([plan.logits.ravel(), z])
-    patch = sharp.patch(jnp.tanh(sharp.encoder[1](jax.nn.relu(sharp.encoder[0](code))))).reshape(R, T)
+    code = jnp.tanh(sharp.encoder[1](jax.nn.relu(sharp.encoder[0](code))))
+    patch = sharp.patch(jnp.concatenate([code, z])).reshape(R, T)
     found, _ = step(sharp, z, plan, True)
     np.testing.assert_allclose(found.logits, shift(plan.logits) + patch, atol=1e-5)
 
@@ -142,7 +143,7 @@ def test_planning_at_every_step_from_what_is_seen_alone_is_a_feed_forward_networ
         plan, _ = step(one, z, plan, True)
         hidden = jnp.tanh(one.encoder[1](jax.nn.relu(z @ blind[R:] + one.encoder[0].bias)))
         weight = attention(one.focus(z), 1, 1)[0, 0]
-        np.testing.assert_allclose(plan.logits[:, 0], weight * one.patch(hidden), rtol=1e-5)
+        np.testing.assert_allclose(plan.logits[:, 0], weight * one.patch(jnp.concatenate([hidden, z])), rtol=1e-5)
 
 
 # Gradients.
