@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -60,3 +64,30 @@ def test_networks_learn_in_it(name, config):
     lengths = history.episodes(0).length_steps
     assert len(lengths) >= 2
     assert (lengths == 9).all()
+
+
+def test_the_places_in_montezumas_first_room(capsys):
+    """The program of docs/hdqn.md runs; down is the foot of the ladder, a jump to the left the left door."""
+    text = (Path(__file__).parents[2] / "docs" / "hdqn.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    names: dict = {}
+    exec(compile(program.replace("2_500_000", "64"), "docs/hdqn.md", "exec", dont_inherit=True), names)
+    assert "'key': " in capsys.readouterr().out
+
+    game = gymnasium.make("ale_py:ALE/MontezumaRevenge-v5", obs_type="ram", repeat_action_probability=0.0)
+    actions = game.unwrapped.get_action_meanings()
+
+    def held(*script: tuple[str, int]) -> list[str]:
+        """Which goals hold on the way, each once."""
+        seen, _ = game.reset(seed=0)
+        found: dict[str, None] = {}
+        for word in [word for word, count in script for _ in range(count)]:
+            seen, *_ = game.step(actions.index(word))
+            state = SimpleNamespace(seen=SimpleNamespace(observation=seen))
+            found |= {name: None for name, holds in names["GOALS"].items() if holds(None, state)}
+        return list(found)
+
+    assert held(("NOOP", 10)) == []
+    assert held(("NOOP", 10), ("DOWN", 9)) == ["foot of the middle ladder"]
+    assert held(("NOOP", 10), ("LEFT", 3), ("LEFTFIRE", 10), ("LEFT", 6)) == ["left door"]
+    game.close()
