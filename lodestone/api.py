@@ -8,13 +8,14 @@ from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.option_critic import OptionCriticConfig
 from lodestone.agents.playing import Playback, play, record
-from lodestone.agents.policies import GoalPolicy, MachinePolicy, OptionCriticPolicy, PlanPolicy, Policy
+from lodestone.agents.policies import GoalPolicy, MachinePolicy, OptionCriticPolicy, PlanPolicy, Policy, UnitedPolicy
 from lodestone.agents.pretraining import as_options, pretrain
 from lodestone.agents.q_learning import QLearningConfig
 from lodestone.agents.sarsa import SarsaConfig
 from lodestone.agents.saved import load_options, load_policy, save_options, save_policy
 from lodestone.agents.straw import StrawConfig
 from lodestone.agents.training import train_policy
+from lodestone.agents.united import UnitedConfig
 from lodestone.devices import use_all_cores
 from lodestone.discovery.betweenness import BetweennessConfig
 from lodestone.discovery.catalogue import discover
@@ -104,6 +105,8 @@ __all__ = [
     "Taxi",
     "TwoRooms",
     "Union",
+    "UnitedConfig",
+    "UnitedPolicy",
     "as_options",
     "discover",
     "every_action",

@@ -27,15 +27,15 @@ from lodestone.agents.policies import (
     Policy,
     UnitedPolicy,
 )
-from lodestone.envs.base import Environment, observation_shape
+from lodestone.envs.base import Environment, example_state, observation_shape
 from lodestone.envs.host import HostEnvironment
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
-from lodestone.envs.task import Task
+from lodestone.envs.task import Looks, Task, goal, looks
 from lodestone.errors import BadFile, InvalidConfig, LodestoneError, check_name
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.goal_network import init_goal_network
-from lodestone.learning.named_arrays import Arrays, fill, named_arrays
+from lodestone.learning.named_arrays import Arrays, fill, named_arrays, take
 from lodestone.learning.networks import Convolution, Linear, NetworkConfig, QNetwork, init_q_network
 from lodestone.learning.option_network import OptionNetwork, init_option_network, shown_shape
 from lodestone.learning.plan_network import PlanConfig, init_plan_network
@@ -116,13 +116,21 @@ HEADS = {
 
 def _save_heads(path: Path, policy: UnitedPolicy | GoalPolicy) -> None:
     name, kind = next((name, kind) for name, kind in HEADS.items() if isinstance(policy, kind.policy))
-    if not set(policy.tasks) <= set(kind.ready_made(policy.environment)):
-        raise InvalidConfig("Only networks for an environment's ready-made tasks or goals can be saved.")
+    arrays, environment = named_arrays(policy.networks, "learned"), policy.environment
+    for position, task in enumerate(policy.tasks):
+        if task in kind.ready_made(environment):
+            continue
+        if not isinstance(task.stop, Looks) or task != goal(environment, task.name, task.stop):
+            raise InvalidConfig(
+                "Only networks for an environment's ready-made tasks or goals, or for goals that are given by what is "
+                "seen there, can be saved."
+            )
+        arrays[f"looks/{position}"] = task.stop.observation.astype(_seen(environment).dtype)
     header = {
         "kind": "policy",
         "version": __version__,
         "agent": policy.agent,
-        "environment": describe_environment(policy.environment),
+        "environment": describe_environment(environment),
         name: {
             "tasks": [task.name for task in policy.tasks],
             "option_cap": policy.option_cap,
@@ -133,7 +141,12 @@ def _save_heads(path: Path, policy: UnitedPolicy | GoalPolicy) -> None:
         "reward_scale": policy.reward_scale,
         "seeds": list(policy.seeds),
     }
-    write_arrays(path, named_arrays(policy.networks, "learned"), header)
+    write_arrays(path, arrays, header)
+
+
+def _seen(environment: Environment) -> jax.ShapeDtypeStruct:
+    """Shape and dtype of what an agent sees."""
+    return jax.eval_shape(environment.observe, example_state(environment))
 
 
 def _save_option_critic_policy(path: Path, policy: OptionCriticPolicy) -> None:
@@ -216,14 +229,19 @@ def _build_heads(
 ) -> UnitedPolicy | GoalPolicy:
     seeds = tuple(int(seed) for seed in header["seeds"])
     known = {task.name: task for task in kind.ready_made(environment)}
-    for name in recipe["tasks"]:
-        check_name("task", name, tuple(known))
-    chosen = tuple(known[name] for name in recipe["tasks"])
     shape, shared = _build_shape(recipe["shape"]), recipe["shared"]
-    seen = observation_shape(environment)
+    seen = _seen(environment)
+
+    def task(position: int, name: str) -> Task:
+        if f"looks/{position}" in arrays:
+            return goal(environment, str(name), looks(take(arrays, f"looks/{position}", seen.shape, seen.dtype)))
+        check_name("task", name, tuple(known))
+        return known[name]
+
+    chosen = tuple(task(position, name) for position, name in enumerate(recipe["tasks"]))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), len(seeds)))
     template = jax.eval_shape(
-        jax.vmap(lambda key: kind.init(shape, shared, seen, environment.num_actions, len(chosen), key)), keys
+        jax.vmap(lambda key: kind.init(shape, shared, seen.shape, environment.num_actions, len(chosen), key)), keys
     )
     return kind.policy(
         agent=str(header["agent"]),

@@ -31,14 +31,18 @@ from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from lodestone.envs.base import (
     Environment,
+    OutsideEnvironment,
+    allowed_actions,
     example_state,
     observation_shape,
+    remembered,
 )
 from lodestone.envs.task import Task, begun_at
 from lodestone.errors import InvalidConfig, check_name
 from lodestone.learning.adam import adam_step, start_adam
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.networks import NetworkConfig
+from lodestone.learning.policies import greedy
 from lodestone.learning.prioritized import Drawn, PrioritizedReplay, draw, empty_prioritized, remember, renew
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import double_semi_markov_target, semi_markov_target
@@ -47,6 +51,7 @@ from lodestone.learning.united_execution import (
     TaskActor,
     UnitedActor,
     explore,
+    look,
     start_task_actor,
     start_united_actor,
     task_tick,
@@ -153,7 +158,8 @@ class UnitedConfig:
     """Further copies, per seed, that the manager acts in, for every kind of start that the options' own tasks have:
     their episodes begin there. The run's length does not count their steps, nor those on the options' tasks."""
     task_environments: int = 4
-    """Copies of every option's own task, per seed, in which its policy alone acts."""
+    """Copies of every option's own task, per seed, in which its policy alone acts; with 0, options learn from the steps
+    of the environments that the manager acts in."""
     task_step_limit: int = 100
     """Steps after which an episode of an option's own task is truncated."""
     ticks_per_round: int = 2
@@ -187,7 +193,6 @@ class UnitedConfig:
             "replay_capacity",
             "target_period",
             "environments",
-            "task_environments",
             "task_step_limit",
             "ticks_per_round",
             "updates_per_round",
@@ -197,6 +202,7 @@ class UnitedConfig:
         for name in (
             "learning_starts",
             "start_environments",
+            "task_environments",
             "policy_weight",
             "termination_weight",
             "manager_weight",
@@ -247,14 +253,15 @@ def policy_loss(
     values: Float[Array, " A"],
     next_values: Float[Array, " N"],
     next_preferences: Float[Array, " N"],
+    next_available: Bool[Array, " N"],
     action: Int[Array, ""],
     reward: Float[Array, ""],
     end: Bool[Array, ""],
 ) -> Float[Array, ""]:
-    """One policy head's Huber loss for one step, by its own task's reward and end, against the best of N values of the
-    next state: its own, or those of the manager's choices."""
+    """One policy head's Huber loss for one step, by its own task's reward and end, against the best available of N
+    values of the next state: its own, or those of the manager's choices."""
     kept = jnp.where(end, 0.0, discount)
-    target = _target(config, reward * config.reward_scale, kept, next_values, next_preferences)
+    target = _target(config, reward * config.reward_scale, kept, next_values, next_preferences, next_available)
     return optax.huber_loss(values[action], jax.lax.stop_gradient(target), delta=config.huber_delta)
 
 
@@ -277,12 +284,11 @@ def _target(
     discount: Float[Array, ""],
     next_values: Float[Array, " N"],
     next_preferences: Float[Array, " N"],
-    next_available: Bool[Array, " N"] | None = None,
+    next_available: Bool[Array, " N"],
 ) -> Float[Array, ""]:
-    available = jnp.ones(next_values.shape, dtype=bool) if next_available is None else next_available
     if config.double:
-        return double_semi_markov_target(reward, discount, next_values, next_preferences, available)
-    return semi_markov_target(reward, discount, next_values, available)
+        return double_semi_markov_target(reward, discount, next_values, next_preferences, next_available)
+    return semi_markov_target(reward, discount, next_values, next_available)
 
 
 def termination_loss(logits: Float[Array, "B n 2"], ended: Bool[Array, "B n"]) -> Float[Array, " n"]:
@@ -359,18 +365,22 @@ def loss(
         values = jax.vmap(partial(each_head, network.policies))(at_state)
         next_values = jax.vmap(partial(each_head, target.policies))(seen_next)
         preferences = jax.vmap(partial(each_head, network.policies))(held)
+        allowed = jax.vmap(partial(allowed_actions, environment))(steps.next_state)
         for head, task in enumerate((environment, *options)):
             if ("basic policy" if head == BASIC else "option policies") not in learns:
                 continue
             rewards = jax.vmap(task.reward)(steps.state, steps.action, steps.next_state)
             ends = jax.vmap(task.terminal)(steps.next_state)
-            after, preferred = next_values[:, head], preferences[:, head]
+            if isinstance(environment, OutsideEnvironment):  # after whose end nothing is seen, whatever the task
+                ends |= jax.vmap(environment.terminal)(steps.next_state)
+            after, preferred, available = next_values[:, head], preferences[:, head], allowed
             if head == BASIC and "manager" in learns:
                 follows = jax.vmap(partial(after_basic_step, config))
                 after = follows(after, jax.vmap(target.manager)(seen_next))
                 preferred = follows(preferred, jax.vmap(network.manager)(held))
+                available = jnp.concatenate([allowed, jnp.ones((size, len(options)), dtype=bool)], axis=1)
             of_head = jax.vmap(partial(policy_loss, config, discount))
-            of_steps += of_head(values[:, head], after, preferred, steps.action, rewards, ends)
+            of_steps += of_head(values[:, head], after, preferred, available, steps.action, rewards, ends)
         total += config.policy_weight * jnp.sum(steps_drawn.weights * of_steps)
     if "terminations" in learns and options:
         logits = jax.vmap(partial(each_head, network.terminations))(at_next)
@@ -384,7 +394,8 @@ def loss(
         preferences = jax.vmap(lambda seen: network.manager(network.features(seen)))(next_seen)
         losses = jax.vmap(partial(manager_loss, config))(values, next_values, preferences, transition)
         actions = jax.vmap(partial(each_head, network.policies))(jax.lax.stop_gradient(at_decision))
-        would_do = jnp.argmax(jnp.take_along_axis(actions, transition.action[:, None, None], axis=1)[:, 0], axis=-1)
+        chosen = jnp.take_along_axis(actions, transition.action[:, None, None], axis=1)[:, 0]
+        would_do = jax.vmap(greedy)(chosen, jax.vmap(partial(allowed_actions, environment))(transition.obs))
         of_decisions = jnp.where(would_do == decisions.first_action, losses, 0.0)
         total += config.manager_weight * jnp.sum(decisions_drawn.weights * of_decisions)
     return total, Errors(jnp.sqrt(2 * of_steps), jnp.sqrt(2 * of_decisions))
@@ -447,7 +458,12 @@ def united(
 
     `steps`, the run's length, is what schedules and stages are fractions of; it bounds the replays' memory, too.
     `stages` replaces what `config.training` says. `init` takes a network to start from, too.
+    Raises `InvalidConfig` for an environment outside that would have to begin where the options' tasks do.
     """
+    if isinstance(environment, OutsideEnvironment) and (config.start_environments or config.task_environments):
+        raise InvalidConfig(
+            "A Gymnasium environment begins where it wants: start_environments and task_environments must be 0."
+        )
     stages = stages or TRAINING[config.training]
     rounds = config.rounds(steps)
     in_all = sum(stage.share for stage in stages)
@@ -457,13 +473,14 @@ def united(
     places = (environment, *(begun_at(environment, start) for start in starts_of_tasks))
     copies = (config.environments, *[config.start_environments] * len(starts_of_tasks))
     decided_per_round = config.ticks_per_round * sum(copies)
-    seen_per_round = decided_per_round + config.ticks_per_round * len(options) * config.task_environments
+    on_tasks = tuple(options) if config.task_environments else ()  # those that act on their own tasks
+    seen_per_round = decided_per_round + config.ticks_per_round * len(on_tasks) * config.task_environments
     learning_starts = config.rounds(config.learning_starts)
     powers = [1 + config.epsilon_spread * jnp.linspace(0.0, 1.0, count) for count in copies]
 
     def init(key: PRNGKeyArray, start: UnitedNetwork | None = None) -> Carry:
         network_key, actor_key, key = jax.random.split(key, 3)
-        state = example_state(environment)
+        state = remembered(environment, example_state(environment))
         if start is None:
             seen, actions = observation_shape(environment), environment.num_actions
             start = init_united_network(config.network, config.shared, seen, actions, len(options), network_key)
@@ -492,7 +509,7 @@ def united(
             ),
             task_actors=tuple(
                 jax.vmap(partial(start_task_actor, option))(jax.random.split(option_key, config.task_environments))
-                for option, option_key in zip(options, jax.random.split(task_keys, len(options)), strict=True)
+                for option, option_key in zip(on_tasks, jax.random.split(task_keys, len(on_tasks)), strict=True)
             ),
             key=key,
         )
@@ -510,7 +527,7 @@ def united(
             keys = jax.random.split(key, len(places))
             for place, count, power, actor, place_key in zip(places, copies, powers, united_actors, keys, strict=True):
                 uniform = jax.random.uniform(place_key, (count, 4))
-                outputs = jax.vmap(lambda state: network(environment.observe(state)))(actor.actor.state)
+                outputs = jax.vmap(partial(look, environment, network))(actor.actor.state)
                 decisions = jax.vmap(explore, in_axes=(0, 0, 0, None))(
                     outputs, uniform[:, :2], epsilon**power, "manager" in stage.learns
                 )
@@ -521,8 +538,8 @@ def united(
                 ticked.append(ticks)
             ticks = _concatenate(*ticked)
             stepped, next_task_actors = [ticks.step], []
-            of_tasks = jax.random.uniform(task_key, (len(options), config.task_environments, 4))
-            for position, (option, actor) in enumerate(zip(options, task_actors, strict=True)):
+            of_tasks = jax.random.uniform(task_key, (len(on_tasks), config.task_environments, 4))
+            for position, (option, actor) in enumerate(zip(on_tasks, task_actors, strict=True)):
                 head = network.policy(BASIC + 1 + position)
                 values = jax.vmap(lambda state, head=head: head(environment.observe(state)))(actor.state)
                 actor, step = jax.vmap(partial(task_tick, option, config.task_step_limit), in_axes=(0, None, 0, 0))(

@@ -23,7 +23,7 @@ EXTRAS = {
     "ray": ("`lodestone sweep`, on this machine or many", "lodestone[cluster]"),
     "pygame": ("pictures of Gymnasium's own environments", "pygame"),
     "minigrid": ("MiniGrid environments, as minigrid:ID", "minigrid"),
-    "ale-py": ("Atari environments, as ale_py:ID", "ale-py"),
+    "ale-py": ("Atari games, as lodestone.envs.atari:Atari/NAME-v5", "lodestone[atari]"),
     "stable-baselines3": ("benchmarks beside Stable-Baselines3, and its learners over options", "lodestone[bridges]"),
     "tensorboardX": ("runs for TensorBoard", "lodestone[tensorboard]"),
     "pytest": ("running the tests", "lodestone[dev]"),

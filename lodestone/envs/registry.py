@@ -33,7 +33,7 @@ ENVIRONMENTS: dict[str, type[Environment]] = {
 GYMNASIUM = "gymnasium"
 """The name of all those that Gymnasium makes by an id."""
 
-PLUGINS = ("minigrid", "ale_py")
+PLUGINS = ("minigrid", "ale_py", "lodestone.envs.atari")
 """Modules that an id may name without being imported before: a file's id must not run a stranger's code."""
 
 

@@ -83,9 +83,13 @@ class Looks:
     shape: tuple[int, ...]
     dtype: str
 
+    @property
+    def observation(self) -> np.ndarray:
+        """What is seen there."""
+        return np.frombuffer(self.values, self.dtype).reshape(self.shape)
+
     def __call__(self, environment: Environment, state: State) -> Bool[Array, ""]:
-        wanted = np.frombuffer(self.values, self.dtype).reshape(self.shape)
-        return jnp.all(environment.observe(state) == wanted)
+        return jnp.all(environment.observe(state) == self.observation)
 
 
 def looks(observation: Observation) -> Looks:

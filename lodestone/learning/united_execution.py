@@ -15,10 +15,19 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, initial_state, inverse_cdf, next_step
+from lodestone.envs.base import (
+    Environment,
+    OutsideEnvironment,
+    allowed_actions,
+    initial_state,
+    inverse_cdf,
+    next_episode,
+    next_step,
+    remembered,
+)
 from lodestone.envs.task import Task
 from lodestone.learning.evaluation import Episode, Trace
-from lodestone.learning.policies import greedy
+from lodestone.learning.policies import greedy, mask_unavailable
 from lodestone.learning.united_network import BASIC, Outputs, UnitedNetwork
 from lodestone.options.base import Options
 from lodestone.options.execution import Actor, Decision, Rules, start_actor
@@ -74,6 +83,13 @@ def choices(options: Sequence[Task]) -> tuple[str, ...]:
     return ("basic policy", *(option.name for option in options))
 
 
+def look(environment: Environment, network: UnitedNetwork, state: State) -> Outputs:
+    """What the heads say of a state: of an action that may not be taken there, that it is worth minus infinity."""
+    outputs = network(environment.observe(state))
+    allowed = allowed_actions(environment, state)
+    return outputs._replace(actions=mask_unavailable(outputs.actions, allowed[None]))
+
+
 def greedy_decision(outputs: Outputs) -> tuple[Int[Array, ""], Int[Array, " n+1"]]:
     """The manager's best choice, and every policy head's best action."""
     return jnp.argmax(outputs.choices).astype(jnp.int32), jnp.argmax(outputs.actions, axis=1).astype(jnp.int32)
@@ -87,17 +103,20 @@ def may_stop(outputs: Outputs) -> Bool[Array, " n+1"]:
 def explore(
     outputs: Outputs, uniform: Float[Array, " 2"], epsilon: Float[Array, ""], manager_acts: bool
 ) -> tuple[Int[Array, ""], Int[Array, " n+1"]]:
-    """The same with probability 1 - epsilon; otherwise one of the primitive actions and options, all alike. Without the
-    manager the basic policy alone is chosen, and only primitive actions are drawn."""
-    heads, actions = outputs.actions.shape
+    """The same with probability 1 - epsilon; otherwise one of the allowed primitive actions and the options, all alike.
+    Without the manager the basic policy alone is chosen, and only primitive actions are drawn."""
+    heads, _ = outputs.actions.shape
     choice, best = greedy_decision(outputs)
     if not manager_acts:
         choice = jnp.int32(BASIC)
+    up_to = jnp.cumsum((outputs.actions[BASIC] > -jnp.inf).astype(jnp.int32))
+    actions = up_to[-1]
     candidates = actions + (heads - 1 if manager_acts else 0)
-    drawn = jnp.minimum((uniform[1] * jnp.float32(candidates)).astype(jnp.int32), candidates - 1)
+    drawn = jnp.minimum((uniform[1] * candidates.astype(jnp.float32)).astype(jnp.int32), candidates - 1)
     at_random = uniform[0] < epsilon
     choice = jnp.where(at_random, jnp.maximum(drawn - actions + 1, BASIC), choice)
-    basic = jnp.where(at_random & (drawn < actions), drawn, best[BASIC])
+    action = jnp.argmax(up_to > drawn).astype(jnp.int32)
+    basic = jnp.where(at_random & (drawn < actions), action, best[BASIC])
     return choice, best.at[BASIC].set(basic)
 
 
@@ -123,6 +142,8 @@ def tick(
     capped = (actor.option != BASIC) & (actor.elapsed >= option_cap)
     stops = running & (may_stop(outputs)[actor.option] | capped)
     truncated = jnp.bool_(False)
+    if isinstance(environment, OutsideEnvironment):
+        truncated = environment.truncated(actor.state)
     if rules.step_limit is not None:
         truncated |= actor.episode_steps >= rules.step_limit
     if rules.decision_limit is not None:
@@ -142,7 +163,7 @@ def tick(
             action=actor.option,
             reward=actor.reward,
             discount=jnp.where(no_future, 0.0, rules.discount if rules.discount_per_decision else actor.discount),
-            next_obs=actor.state,
+            next_obs=remembered(environment, actor.state),
             next_available=jnp.where(cut, jnp.arange(everything.size) == actor.option, everything),
         ),
         steps=actor.elapsed,
@@ -157,7 +178,10 @@ def tick(
     choice, actions = decision
     option = jnp.where(fresh, choice, actor.option)
     action = actions[option]
-    moved = next_step(environment, uniform[0], actor.state, action)
+    before = actor.state
+    if isinstance(environment, OutsideEnvironment):  # where a step cannot be taken back
+        before = environment.hold(before, over)
+    moved = next_step(environment, uniform[0], before, action)
     elapsed = jnp.where(fresh, 0, actor.elapsed)
     discount = jnp.where(fresh, 1.0, actor.discount)
     weight = 1.0 if rules.undiscounted_option_reward else discount
@@ -165,7 +189,7 @@ def tick(
     onward = Actor(
         state=moved.state,
         deciding=jnp.bool_(False),
-        start=_select(fresh, actor.state, actor.start),
+        start=_select(fresh, remembered(environment, actor.state), actor.start),
         option=option,
         elapsed=elapsed + 1,
         reward=jnp.where(fresh, 0.0, actor.reward) + weight * moved.reward - call_cost,
@@ -174,13 +198,14 @@ def tick(
         episode_steps=actor.episode_steps + 1,
         episode_decisions=actor.episode_decisions + fresh.astype(jnp.int32),
     )
-    state = initial_state(environment, uniform[1])
+    state = next_episode(environment, uniform[1], actor.state)
     restart = jax.tree.map(jnp.zeros_like, onward)._replace(
-        state=state, start=state, deciding=jnp.bool_(True), discount=jnp.float32(1)
+        state=state, start=remembered(environment, state), deciding=jnp.bool_(True), discount=jnp.float32(1)
     )
     next_actor = _select(over, restart, onward)
     next_first = jnp.where(fresh, action, first_action)
-    brought = Tick(settled, first_action, ~over, Step(actor.state, action, moved.state), option, fresh & ~over)
+    step = Step(remembered(environment, actor.state), action, remembered(environment, moved.state))
+    brought = Tick(settled, first_action, ~over, step, option, fresh & ~over)
     return UnitedActor(next_actor, next_first), brought
 
 
@@ -229,7 +254,7 @@ class UnitedOptions(Options):
         return jnp.ones(self.size, dtype=bool)
 
     def action_probs(self, state: State) -> Float[Array, "O A"]:
-        _, actions = greedy_decision(self.network(self.environment.observe(state)))
+        _, actions = greedy_decision(look(self.environment, self.network, state))
         return jax.nn.one_hot(actions, self.environment.num_actions)
 
     def termination(self, state: State) -> Float[Array, " O"]:
@@ -295,7 +320,7 @@ def _greedy_tick(
     key: PRNGKeyArray,
     united: UnitedActor,
 ) -> tuple[UnitedActor, Outputs, Tick]:
-    outputs = network(environment.observe(united.actor.state))
+    outputs = look(environment, network, united.actor.state)
     decision, uniform = greedy_decision(outputs), jax.random.uniform(key, (2,))
     next_united, brought = tick(environment, rules, option_cap, outputs, decision, uniform, united)
     return next_united, outputs, brought

@@ -16,7 +16,7 @@ from lodestone.envs.base import example_state
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.magnet_arm import MagnetArm, arm_is_down, go_down_task, random_layouts
 from lodestone.envs.state_space import reachable_states
-from lodestone.envs.task import Task
+from lodestone.envs.task import Task, goal, looks
 from lodestone.errors import BadFile, InvalidConfig
 from lodestone.files import read_arrays, write_arrays
 from lodestone.learning.goal_network import init_goal_network
@@ -83,7 +83,13 @@ def policy_with_heads(kind, for_tasks) -> UnitedPolicy | GoalPolicy:
 HEADS = [(UnitedPolicy, tasks(ARM)), (GoalPolicy, goals(ARM))]
 
 
-@pytest.mark.parametrize(("kind", "for_tasks"), HEADS)
+SEEN = (
+    goal(ARM, "start", looks(ARM.observe(example_state(ARM)))),
+    goal(ARM, "dark", looks(np.zeros((12, 9, 3), "u1"))),
+)
+
+
+@pytest.mark.parametrize(("kind", "for_tasks"), [*HEADS, *((kind, (*others, *SEEN)) for kind, others in HEADS)])
 def test_networks_of_heads_come_back(kind, for_tasks, tmp_path):
     policy = policy_with_heads(kind, for_tasks)
     save_policy(tmp_path / "policy.safetensors", policy)
