@@ -53,6 +53,7 @@ def numpy_step(one, seen, plan, anew, noise, sharpness):
         for column in range(columns):
             shifted[row, column] += sum(patch[row, k] * filters[k, column] for k in range(shape.patch))
     when = numpy_linear(one.schedule, np.concatenate([focus, code]))
-    bells = [numpy_bell((when[0] + 1) / 2 * (columns - 1), when[1], column) for column in range(columns)]
+    log_variance = 2 - np.log1p(np.exp(2 - when[1]))
+    bells = [numpy_bell((when[0] + 1) / 2 * (columns - 1), log_variance, column) for column in range(columns)]
     logits = sharpness * (shape.background + shape.peak * np.array(bells))
     return shifted, 1 / (1 + np.exp(-logits)), apart

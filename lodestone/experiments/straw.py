@@ -58,7 +58,7 @@ MAZE_STEPS = 1_200_000
 PLANNING, EVERY_STEP = "STRAW", "STRAW, a new plan at every step"
 _MAZE_CONFIG = StrawConfig(
     network=NetworkConfig(kernels=(), strides=(), channels=(), hidden=(64,)),
-    commitment_cost=((0.0, 0.0), (0.4, 0.0), (0.6, 0.06)),
+    commitment_cost=((0.0, 0.0), (0.4, 0.0), (0.6, 0.05)),
     learning_rate=((0.0, 2e-3), (0.6, 2e-3), (1.0, 1e-4)),
     reward_scale=0.1,
 )

@@ -20,6 +20,9 @@ from jaxtyping import Array, Bool, Float
 LOGARITHMS = (-5.0, 5.0)
 """Bounds of the logarithms of variances and strides: beyond them filters fall between two columns or off the plan."""
 
+WIDEST = 2.0
+"""Below it the logarithm of a commitment's variance stays: a wider bell would say the same of all steps."""
+
 
 def attention(focus: Float[Array, " 3"], columns: int, width: int) -> Float[Array, "K T"]:
     """F, the K = `width` filters over T columns; each sums to 1, or to less where it lies outside the plan.
@@ -60,11 +63,13 @@ def commitment(
 ) -> Float[Array, " T"]:
     """c, high around one step: the logistic function of `background` plus one bell of height `peak`.
 
-    The focus is (centre, log of the variance). The bell is divided by its maximum, not by its sum as the filters of
-    `attention` are: so it is 1 at its centre whatever its width, and the peak can come as near to 1 as it should.
-    `sharpness` is a factor on the logits: near 0 everything is drawn, and the gradient passes.
+    The focus is (centre, log of the variance while that is small). The bell is divided by its maximum, not by its sum
+    as the filters of `attention` are: so it is 1 at its centre whatever its width, and the peak can come as near to 1
+    as it should. `sharpness` is a factor on the logits: near 0 everything is drawn, and the gradient passes.
     """
-    bell = _bells((focus[:1] + 1) / 2 * (columns - 1), focus[1], columns)[0]
+    # Bounded smoothly: were it flat, or clipped, no gradient would ever make it narrower again.
+    log_variance = WIDEST - jax.nn.softplus(WIDEST - focus[1])
+    bell = _bells((focus[:1] + 1) / 2 * (columns - 1), log_variance, columns)[0]
     return jax.nn.sigmoid(sharpness * (background + peak * bell))
 
 

@@ -109,6 +109,20 @@ def test_the_peak_of_a_commitment_does_not_depend_on_its_width():
         assert int(jnp.argmax(c)) == 3
 
 
+@pytest.mark.parametrize("log_variance", [-2.0, 3.0, 8.0])
+def test_the_widest_bell_can_still_become_narrower(log_variance):
+    """Beside the peak a narrower bell commits itself less; the gradient says so at any width."""
+
+    def beside(log_variance):
+        return commitment(jnp.stack([jnp.float32(-1), log_variance]), 6, 12.0, -6.0, jnp.float32(0.3))[1]
+
+    gradient = float(jax.grad(beside)(jnp.float32(log_variance)))
+    step = 1e-2
+    ends = [float(beside(jnp.float32(log_variance + sign * step))) for sign in (-1, 1)]
+    assert gradient > 1e-6
+    assert gradient == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=0.1, abs=2e-5)
+
+
 # Steps of time.
 
 
