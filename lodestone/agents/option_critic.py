@@ -26,14 +26,23 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.agents.q_learning import STEPS_PER_ROUND
 from lodestone.envs.base import Environment, Step, inverse_cdf
-from lodestone.envs.state_space import Numbers
+from lodestone.envs.host import HostEnvironment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose, largest
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
-from lodestone.options.execution import REWARD_SWITCHES, Actor, Rules, deal, start_actor, tick, uniforms
+from lodestone.options.execution import (
+    REWARD_SWITCHES,
+    Actor,
+    Rules,
+    after_step,
+    deal,
+    start_actor,
+    take_step,
+    uniforms,
+)
 from lodestone.options.soft import SoftOptions
-from lodestone.planning.enumerated import Enumerated, enumerated, look_up_step
+from lodestone.planning.enumerated import Enumerated, World, enumerated, num_rows, numbering, row_of
 from lodestone.planning.tables import tabulate
 
 Critic = Literal["greedy", "on-policy"]
@@ -175,28 +184,32 @@ def refuse_rules(rules: Rules) -> None:
 
 
 def option_critic(config: OptionCriticConfig, environment: Environment, rules: Rules, steps: int) -> Algorithm:
-    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
-    `steps`.
+    """The algorithm for the training loop; it learns on the tables of the environment, or in a Gymnasium environment by
+    the number that this shows. Schedules are fractions of `steps`.
 
     Raises `TooManyStates` where the tables would be too large, and `InvalidConfig` for rules under which an option's
-    reward is not the discounted sum of its steps' rewards or a limit is an end.
+    reward is not the discounted sum of its steps' rewards or a limit is an end, and for a Gymnasium environment that
+    shows no number.
     """
+    if isinstance(environment, HostEnvironment):
+        return option_critic_on_numbers(config, environment, rules, steps)
     return option_critic_on_numbers(config, enumerated(tabulate(environment), environment.action_names), rules, steps)
 
 
-def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rules: Rules, steps: int) -> Algorithm:
-    """The same in a world of numbered states."""
+def option_critic_on_numbers(config: OptionCriticConfig, world: World, rules: Rules, steps: int) -> Algorithm:
+    """The same in a world of numbered states, or in a Gymnasium environment."""
     refuse_rules(rules)
-    # The fields of `Chance`: options draw their actions and their ends.
-    needed = (True, True, world.num_outcomes > 1, len(world.initial_states) > 1)
+    # The fields of `Chance`: options draw their actions and their ends. A Gymnasium environment draws for itself.
+    restarts = isinstance(world, Enumerated) and len(world.initial_states) > 1
+    needed, rows = (True, True, world.num_outcomes > 1, restarts), num_rows(world)
     everything = jnp.ones(config.num_options, dtype=bool)
 
     def options_of(learned: Learned) -> SoftOptions:
-        return SoftOptions(Numbers(world.ends.size), learned.preferences, learned.exits, config.temperature)
+        return SoftOptions(numbering(world), learned.preferences, learned.exits, config.temperature)
 
     def init(key: PRNGKeyArray) -> Carry:
         actor_key, key = jax.random.split(key)
-        learned = nothing_learned((world.ends.size, config.num_options), world.num_actions)
+        learned = nothing_learned((rows, config.num_options), world.num_actions)
         return Carry(learned, start_actor(world, actor_key), key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
@@ -214,13 +227,14 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
 
         def step(carry: tuple[Learned, Actor], noise: Float[Array, " N"]) -> tuple[tuple[Learned, Actor], tuple]:
             learned, actor = carry
-            state, chance = actor.state, deal(noise[2:], needed)
+            state, chance = row_of(world, actor.state), deal(noise[2:], needed)
             choice = choose(noise[:2], learned.table[state], everything, epsilon)
             option = jnp.where(actor.deciding, choice, actor.option)
             acting = options_of(learned)
-            probs = acting.action_probs(state)[option]
+            probs = acting.action_probs(actor.state)[option]
             action = inverse_cdf(probs, chance.action)
-            arrived = look_up_step(world, chance.outcome, state, action)
+            taken = take_step(world, chance.outcome, actor.state, action)
+            arrived = taken._replace(state=row_of(world, taken.state))
 
             if config.order == "authors":
                 on_the_way = actor.episode_steps > 0
@@ -233,9 +247,8 @@ def option_critic_on_numbers(config: OptionCriticConfig, world: Enumerated, rule
                 learned = improve_policy(learned, state, option, action, probs, policy_rate)
                 learned = improved_termination(learned, arrived.state, option, ~arrived.terminated)
 
-            # The step that was looked up, by the policy that drew its action; the coin is that of the new termination.
-            stopping = options_of(learned._replace(preferences=acting.preferences))
-            actor, decision = tick(world, stopping, rules, chance, actor, choice)
+            # The coin is that of the new termination.
+            actor, decision = after_step(world, options_of(learned), rules, chance, actor, option, action, taken)
             return (learned, actor), (decision, loss)
 
         noise = uniforms(noise_key, (STEPS_PER_ROUND, 2 + sum(needed)))

@@ -12,8 +12,6 @@ from jaxtyping import Array, Float
 
 from lodestone.agents.option_critic import Learned
 from lodestone.envs.base import Environment
-from lodestone.envs.host import HostEnvironment
-from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Task
 from lodestone.learning.goal_network import GoalNetwork, GoalOptions
 from lodestone.learning.networks import NetworkConfig, QNetwork
@@ -25,6 +23,7 @@ from lodestone.machines.machine import Hierarchy
 from lodestone.options.base import Options
 from lodestone.options.execution import Rules
 from lodestone.options.soft import SoftOptions, numbered_names
+from lodestone.planning.enumerated import numbering
 from lodestone.planning.joint import JointProcess, joint_process
 from lodestone.types import State
 
@@ -52,9 +51,7 @@ class Policy:
         """The same of what one seed has learned."""
         if isinstance(learned, QNetwork):
             return lambda state: learned(self.environment.observe(state)) / self.reward_scale
-        if isinstance(self.environment, HostEnvironment):
-            return lambda state: learned[state.seen.observation] / self.reward_scale
-        space = reachable_states(self.environment)
+        space = numbering(self.environment)
         return lambda state: learned[space.index_of(state)] / self.reward_scale
 
 
@@ -182,7 +179,7 @@ class OptionCriticPolicy:
         """The options of one seed."""
         if isinstance(learned, OptionNetwork):
             return SoftNetworkOptions(self.environment, learned, self.temperature)
-        space = reachable_states(self.environment)
+        space = numbering(self.environment)
         return SoftOptions(space, learned.preferences, learned.exits, self.temperature)
 
     def values_of(self, learned: Learned | OptionNetwork) -> Callable[[State], Float[Array, " O"]]:
@@ -190,7 +187,7 @@ class OptionCriticPolicy:
         if isinstance(learned, OptionNetwork):
             values = SoftNetworkOptions(self.environment, learned, self.temperature).values
             return lambda state: values(state) / self.reward_scale
-        space = reachable_states(self.environment)
+        space = numbering(self.environment)
         return lambda state: learned.table[space.index_of(state)]
 
 

@@ -28,7 +28,6 @@ from lodestone.agents.policies import (
     UnitedPolicy,
 )
 from lodestone.envs.base import Environment, example_state, observation_shape
-from lodestone.envs.host import HostEnvironment
 from lodestone.envs.registry import describe_environment, make_environment
 from lodestone.envs.state_space import reachable_states
 from lodestone.envs.task import Looks, Task, goal, looks
@@ -47,6 +46,7 @@ from lodestone.options.execution import Rules
 from lodestone.options.networks import NetworkOptions
 from lodestone.options.scripted import Scripted
 from lodestone.options.tabular import TabularOptions
+from lodestone.planning.enumerated import numbering
 from lodestone.planning.joint import joint_process
 from lodestone.settings import check_numbers
 
@@ -199,10 +199,7 @@ def load_policy(path: Path) -> AnyPolicy:
         options = _build_options(header["options"], arrays, "options", environment)
         seeds = tuple(int(seed) for seed in header["seeds"])
         if header["network"] is None:
-            if isinstance(environment, HostEnvironment):
-                shape = (len(seeds), environment.num_states, options.size)
-            else:
-                shape = (len(seeds), reachable_states(environment).size, options.size)
+            shape = (len(seeds), numbering(environment).size, options.size)
             template: PyTree = jax.ShapeDtypeStruct(shape, jnp.float32)
         else:
             template = _network_template(header["network"], environment, options.size, len(seeds))
@@ -270,7 +267,7 @@ def _build_option_critic_policy(environment: Environment, header: Recipe, arrays
         temperature = deep.temperature
     else:
         config = OptionCriticConfig(**recipe)
-        shape = (len(seeds), reachable_states(environment).size, config.num_options)
+        shape = (len(seeds), numbering(environment).size, config.num_options)
         template = jax.eval_shape(lambda: nothing_learned(shape, actions))
         temperature, reward_scale = config.temperature, 1.0
     return OptionCriticPolicy(

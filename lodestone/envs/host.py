@@ -150,6 +150,21 @@ class HostEnvironment(OutsideEnvironment):
         return HostState(copy, jnp.int32(0), seen, jnp.float32(0), no, no, seen)
 
 
+class Shown(eqx.Module):
+    """The numbering of states by the number that a Gymnasium environment shows."""
+
+    environment: HostEnvironment
+
+    @property
+    def size(self) -> int:
+        """How many there are. Raises `InvalidConfig` where an observation is no number."""
+        return self.environment.num_states
+
+    def index_of(self, state: HostState) -> Int[Array, ""]:
+        """The number that a state shows."""
+        return state.seen.observation
+
+
 class Registered(HostEnvironment):
     """A Gymnasium environment by its id."""
 

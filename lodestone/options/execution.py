@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from lodestone.envs.base import (
     Environment,
     OutsideEnvironment,
+    Step,
     inverse_cdf,
     next_episode,
     next_step,
@@ -187,17 +188,34 @@ def tick(
 
     The environment restarts by itself after an episode's end; `Decision.transition.next_obs` is the state before that.
     """
-    fresh = actor.deciding
-    option = jnp.where(fresh, choice, actor.option)
+    option = jnp.where(actor.deciding, choice, actor.option)
+    action = inverse_cdf(options.action_probs(actor.state)[option], chance.action)
+    step = take_step(environment, chance.outcome, actor.state, action)
+    return after_step(environment, options, rules, chance, actor, option, action, step)
+
+
+def take_step(environment: Environment, uniform: Float[Array, ""], state: State, action: Int[Array, ""]) -> Step:
+    """What `next_step` does, by a look-up where there are tables."""
+    if isinstance(environment, Enumerated):
+        return look_up_step(environment, uniform, state, action)
+    return next_step(environment, uniform, state, action)
+
+
+def after_step(
+    environment: Environment,
+    options: Options,
+    rules: Rules,
+    chance: Chance,
+    actor: Actor,
+    option: Int[Array, ""],
+    action: Int[Array, ""],
+    step: Step,
+) -> tuple[Actor, Decision]:
+    """The rest of a tick: whether `option` stops where its `action` has led, and what there is to tell then."""
+    fresh, (state, reward, terminated) = actor.deciding, step
     start = _select(fresh, remembered(environment, actor.state), actor.start)
     reward_before = jnp.where(fresh, 0.0, actor.reward)
     discount_before = jnp.where(fresh, 1.0, actor.discount)
-
-    action = inverse_cdf(options.action_probs(actor.state)[option], chance.action)
-    if isinstance(environment, Enumerated):
-        state, reward, terminated = look_up_step(environment, chance.outcome, actor.state, action)
-    else:
-        state, reward, terminated = next_step(environment, chance.outcome, actor.state, action)
 
     elapsed = jnp.where(fresh, 0, actor.elapsed) + 1
     caps = jnp.asarray(options.max_steps, dtype=jnp.int32)

@@ -2,7 +2,7 @@
 
     pi_o(a|s) = softmax over a of theta(s, o, a) / temperature          beta_o(s) = sigmoid(vartheta(s, o))
 
-They may start anywhere.
+They may start anywhere. An action that a Gymnasium environment forbids in s has no part in the softmax there.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from lodestone.envs.host import Shown
 from lodestone.envs.state_space import Numbers, StateSpace
 from lodestone.options.base import NO_CAP, Options
 from lodestone.types import State
@@ -25,7 +26,7 @@ def numbered_names(count: int) -> tuple[str, ...]:
 class SoftOptions(Options):
     """O options over S states."""
 
-    space: StateSpace | Numbers
+    space: StateSpace | Numbers | Shown
     preferences: Float[Array, "S O A"]
     """theta."""
     exits: Float[Array, "S O"]
@@ -45,7 +46,10 @@ class SoftOptions(Options):
         return jnp.ones(self.size, dtype=bool)
 
     def action_probs(self, state: State) -> Float[Array, "O A"]:
-        return jax.nn.softmax(self.preferences[self.space.index_of(state)] / self.temperature)
+        theta = self.preferences[self.space.index_of(state)] / self.temperature
+        if isinstance(self.space, Shown):
+            theta = jnp.where(self.space.environment.allowed(state), theta, jnp.finfo(jnp.float32).min)
+        return jax.nn.softmax(theta)
 
     def termination(self, state: State) -> Float[Array, " O"]:
         return jax.nn.sigmoid(self.exits[self.space.index_of(state)])

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from lodestone.envs.base import Environment, Step, inverse_cdf
-from lodestone.envs.host import HostEnvironment
+from lodestone.envs.host import HostEnvironment, Shown
+from lodestone.envs.state_space import Numbers, StateSpace, reachable_states
 from lodestone.planning.tables import Tables
 from lodestone.types import Observation, State
 
@@ -71,6 +72,17 @@ def num_rows(world: World) -> int:
 def row_of(world: World, state: State) -> Int[Array, ""]:
     """Of a state in such a table."""
     return state if isinstance(world, Enumerated) else state.seen.observation
+
+
+def numbering(environment: Environment) -> StateSpace | Numbers | Shown:
+    """How a tabular learner numbers the states of an environment. Raises `TooManyStates`, and `InvalidConfig` for a
+    Gymnasium environment that shows no number."""
+    match environment:
+        case Enumerated():
+            return Numbers(environment.ends.size)
+        case HostEnvironment():
+            return Shown(environment)
+    return reachable_states(environment)
 
 
 def enumerated(tables: Tables, action_names: tuple[str, ...]) -> Enumerated:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -9,19 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from corridor import Corridor
 from gymnasium import spaces
 
 from lodestone.agents.intra_option import IntraOptionConfig
-from lodestone.agents.playing import play_many
-from lodestone.agents.policies import Policy
+from lodestone.agents.option_critic import OptionCriticConfig
+from lodestone.agents.playing import play_many, record
+from lodestone.agents.policies import OptionCriticPolicy, Policy
 from lodestone.agents.q_learning import QLearningConfig
 from lodestone.agents.sarsa import SarsaConfig
 from lodestone.agents.saved import load_policy, save_policy
 from lodestone.agents.training import check_training, train_policy
+from lodestone.envs.base import Environment
 from lodestone.envs.host import FromFunction, Registered
 from lodestone.errors import InvalidConfig
 from lodestone.options.base import NO_CAP, Options, Union, primitives
 from lodestone.options.execution import Rules
+from lodestone.planning.tables import tabulate
 
 FIRST_PLACE, FIRST_ACTION = 3, 5
 
@@ -132,6 +137,77 @@ def test_the_cliff_is_learned_to_its_exact_optimum(tmp_path):
     save_policy(tmp_path / "policy.safetensors", policy)
     played = play_many(load_policy(tmp_path / "policy.safetensors"), jax.random.key(0), 2)
     np.testing.assert_array_equal(played.total_reward, [[-13, -13]])
+
+
+class Outside(gymnasium.Env):
+    """A deterministic environment of Lodestone as one that shows the number of its state and draws its starts; cut
+    after some steps."""
+
+    render_mode = "rgb_array"
+
+    def __init__(self, environment: Environment, limit: int) -> None:
+        self.tables, self.limit = tabulate(environment), limit
+        self.observation_space = spaces.Discrete(self.tables.num_states)
+        self.action_space = spaces.Discrete(self.tables.num_actions)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.number = int(self.np_random.choice(self.tables.num_states, p=self.tables.initial_probs))
+        self.time = 0
+        return self.number, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        reward = float(self.tables.rewards[self.number, action, 0])
+        self.number, self.time = int(self.tables.successors[self.number, action, 0]), self.time + 1
+        return self.number, reward, bool(self.tables.terminal[self.number]), self.time == self.limit, {}
+
+    def render(self) -> np.ndarray:
+        return np.full((2, 2, 3), self.number, dtype=np.uint8)
+
+
+def outside(environment: Environment, limit: int) -> FromFunction:
+    return FromFunction(partial(Outside, environment, limit))
+
+
+@pytest.mark.parametrize("order", ["theorem", "authors"])
+def test_option_critic_learns_the_same_outside(order):
+    """From the same random numbers, whether the world is a table or shows a number."""
+    corridor, config = Corridor(step_reward=-1.0), OptionCriticConfig(3, temperature=0.5, order=order)
+    inside, told = train_policy(config, corridor, primitives(corridor), Rules(0.9, 7), 640, [0, 1])
+    host = outside(corridor, 7)
+    policy, seen = train_policy(config, host, primitives(host), Rules(0.9), 640, [0, 1])
+    assert isinstance(policy, OptionCriticPolicy)
+    assert isinstance(inside, OptionCriticPolicy)
+    for found, wanted in zip(policy.learned, inside.learned, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-5)
+    for seed in range(2):
+        np.testing.assert_array_equal(seen.episodes(seed).length_steps, told.episodes(seed).length_steps)
+        assert 0 < told.episodes(seed).success.mean() < 1, "no episode was cut"
+    playback = record(policy, 1, jax.random.key(1), "option-critic")
+    assert len(playback.pictures) == len(playback.action) + 1
+
+
+def test_what_option_critic_has_learned_takes_only_what_is_allowed():
+    """It is worth what walking to the end is, but for the steps to the left that its soft policies still take."""
+    walk = FromFunction(Walk)
+    config = OptionCriticConfig(2, temperature=0.1, policy_rate=((0.0, 0.5),), epsilon=((0.0, 0.2),))
+    policy, history = train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 3200, [0, 1])
+    assert isinstance(policy, OptionCriticPolicy)
+    np.testing.assert_allclose(policy.learned.table[:, :4].max(axis=2), [PLACES, PLACES], atol=0.2)
+    np.testing.assert_array_equal(policy.learned.preferences[:, 0], 0)  # with one action there is nothing to prefer
+    assert 0 < history.episodes(0).success.mean() < 1, "no episode was cut"
+    assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
+
+
+def test_option_critic_plays_from_a_file(tmp_path):
+    cliff = Registered("CliffWalking-v1", max_episode_steps=20)
+    policy, _ = train_policy(OptionCriticConfig(2), cliff, primitives(cliff), Rules(), 64, [0, 1])
+    save_policy(tmp_path / "policy.safetensors", policy)
+    loaded = load_policy(tmp_path / "policy.safetensors")
+    for one, other in zip(
+        play_many(policy, jax.random.key(1), 3), play_many(loaded, jax.random.key(1), 3), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_observations_that_are_no_number_are_refused():
