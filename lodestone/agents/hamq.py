@@ -8,11 +8,13 @@ with nothing after the last sum where the episode ended. A choice is known by th
 stack. HAMQ-INT (Bai and Russell 2017): where w' follows in no time, it surely does, so that Q(w, u) is max Q(w', u') by
 substitution, and need not be learned.
 
-It runs on the arrays of the joint process, which are the machines and the environment at once.
+It runs on the arrays of the joint process, which are the machines and the environment at once. In a Gymnasium
+environment they are the machines alone: its state is the number that it shows, and a step has to be asked for.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,7 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, inverse_cdf
+from lodestone.envs.base import Environment, inverse_cdf, next_step, sample_initial
+from lodestone.envs.host import ANEW, HostEnvironment, HostState
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
 from lodestone.learning.policies import epsilon_greedy
@@ -29,7 +32,9 @@ from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.learning.targets import semi_markov_target
 from lodestone.machines.machine import Hierarchy
 from lodestone.options.execution import REWARD_SWITCHES, Rules
+from lodestone.planning.enumerated import row_of
 from lodestone.planning.joint import JointProcess, joint_process
+from lodestone.planning.shown_joint import ShownProcess, shown_process
 
 TICKS_PER_ROUND = 32
 """Ticks between two looks at the schedules. A tick is at most one choice and at most one primitive step: only a choice
@@ -74,6 +79,16 @@ class Runner(NamedTuple):
     """Undiscounted sum of the episode's rewards."""
     episode_steps: Int[Array, ""]
     episode_choices: Int[Array, ""]
+    outside: Outside | None = None
+    """In a Gymnasium environment, what is to know of it."""
+
+
+class Outside(NamedTuple):
+    """A Gymnasium environment while machines run in it."""
+
+    state: HostState
+    allowed: Bool[Array, " A"]
+    """The actions that were allowed at the last choice."""
 
 
 class Carry(NamedTuple):
@@ -107,6 +122,22 @@ class Event(NamedTuple):
     episode_return: Float[Array, ""]
     episode_steps: Int[Array, ""]
     episode_choices: Int[Array, ""]
+    allowed: Bool[Array, " A"] | None
+    """The actions that were allowed at the choice, where not all are."""
+    next_allowed: Bool[Array, " A"] | None
+    """The same where the event came."""
+
+
+class ShownArrays(NamedTuple):
+    """The machines on the device, and the environment whose numbers they look at; the fields are those of
+    `ShownProcess`."""
+
+    environment: HostEnvironment
+    edges: Int[Array, "N U"]
+    actions: Int[Array, " M"]
+    landings: Int[Array, "L S"]
+    landing: Int[Array, " M"]
+    firsts: Bool[Array, "N U A"]
 
 
 class Arrays(NamedTuple):
@@ -130,19 +161,29 @@ def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rul
     `RoundLog.option` is the position of the edge's name in `JointProcess.names`.
     Raises what `joint_process` raises, `InvalidConfig` for rules about options, and for machines without a choice.
     """
-    process = joint_process(environment, hierarchy)
+    process = process_of(environment, hierarchy)
     rules.refuse(REWARD_SWITCHES, "HAMQ has no options")
     if process.num_choices == 0:
         raise InvalidConfig("The machines leave no choice open, so there is nothing to learn.")
-    arrays = on_device(process)
+    arrays: Arrays | ShownArrays
+    if isinstance(process, JointProcess):
+        arrays = on_device(process)
+        chance = bool(((process.probs > 0) & (process.probs < 1)).any()), len(arrays.begins) > 1
+    else:
+        assert isinstance(environment, HostEnvironment)
+        arrays = ShownArrays(environment, *(jnp.asarray(getattr(process, name)) for name in ShownArrays._fields[1:]))
+        chance = (False, False)  # the environment draws for itself
     names = jnp.asarray(process.name)
     into, chain = internal_edges(process)
-    chance = bool(((process.probs > 0) & (process.probs < 1)).any()), len(arrays.begins) > 1
 
     def init(key: PRNGKeyArray) -> Carry:
         start_key, key = jax.random.split(key)
         table = jnp.where(jnp.asarray(process.available), 0.0, -jnp.inf).astype(jnp.float32)
-        return Carry(table, fresh(begin(arrays, jax.random.uniform(start_key))), key)
+        if isinstance(arrays, ShownArrays):
+            runner = begin_outside(arrays, sample_initial(arrays.environment, start_key))
+        else:
+            runner = fresh(begin(arrays, jax.random.uniform(start_key)))
+        return Carry(table, runner, key)
 
     def run_round(carry: Carry, number: Int[Array, ""]) -> tuple[Carry, RoundLog]:
         """`TICKS_PER_ROUND` ticks, each with an update if a choice has had its consequences."""
@@ -153,7 +194,8 @@ def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rul
 
         def step(carry: tuple[Array, Runner], noise: Float[Array, " R"]) -> tuple[tuple[Array, Runner], tuple]:
             table, runner = carry
-            row = table[jnp.minimum(runner.joint, process.num_choices - 1)]
+            allowed = None if runner.outside is None else runner.outside.state.seen.allowed
+            row = values_of(table, arrays, jnp.minimum(runner.joint, process.num_choices - 1), allowed)
             edge = epsilon_greedy(noise[:2], row, row > -jnp.inf, epsilon)
             outcome, restart = (noise[2] if chance[0] else jnp.float32(0)), (noise[-1] if chance[1] else jnp.float32(0))
             runner, event = tick(arrays, process.end, rules, outcome, restart, runner, edge)
@@ -161,9 +203,10 @@ def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rul
                 # Nothing to learn where no time passed, which leaves no trace but the discount.
                 internal = arrays.edges[event.choice, event.edge] < process.num_choices
                 event = event._replace(learned=event.learned & ~internal)
-            table, loss = update(table, event, learning_rate)
+            next_row = values_of(table, arrays, event.next_choice, event.next_allowed)
+            table, loss = update(table, event, next_row, learning_rate)
             if config.internal_transitions:
-                table = substitute(table, into, chain, event.choice)
+                table = substitute(table, arrays, into, chain, event)
             return (table, runner), (event, loss)
 
         # Random numbers are drawn for all ticks together: one by one they would take longer than the ticks.
@@ -186,7 +229,7 @@ def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rul
 
 
 def tick(
-    arrays: Arrays,
+    arrays: Arrays | ShownArrays,
     end: int,
     rules: Rules,
     outcome: Float[Array, ""],
@@ -196,7 +239,7 @@ def tick(
 ) -> tuple[Runner, Event]:
     """Take `edge` if the joint state is a choice, and then a primitive step if it is an action. A new episode begins by
     itself; two uniform numbers in [0, 1) pick nature's draw and where that begins."""
-    num_choices, num_actions = len(arrays.edges), len(arrays.successors)
+    num_choices = len(arrays.edges)
     choosing = runner.joint < num_choices
     choice = jnp.where(choosing, runner.joint, runner.choice)
     edge = jnp.where(choosing, edge, runner.edge)
@@ -206,11 +249,17 @@ def tick(
     elapsed = jnp.where(choosing & runner.chosen, 0, runner.elapsed)
     episode_choices = runner.episode_choices + choosing.astype(jnp.int32)
 
-    acting = (joint >= num_choices) & (joint != end)
-    action = jnp.clip(joint - num_choices, 0, num_actions - 1)
-    draw = inverse_cdf(arrays.probs[action], outcome) if arrays.probs.shape[1] > 1 else jnp.int32(0)
-    reward = jnp.where(acting, arrays.rewards[action, draw], 0.0)
-    arrived = jnp.where(acting, arrays.successors[action, draw], joint)
+    acting, outside = (joint >= num_choices) & (joint != end), None
+    if isinstance(arrays, ShownArrays):
+        assert runner.outside is not None
+        allowed = jnp.where(choosing, runner.outside.state.seen.allowed, runner.outside.allowed)
+        given_up, outside = runner.joint == end, runner.outside._replace(allowed=allowed)
+        outside, arrived, reward = step_outside(arrays, end, outside, joint, acting, given_up)
+    else:
+        action = jnp.clip(joint - num_choices, 0, len(arrays.successors) - 1)
+        draw = inverse_cdf(arrays.probs[action], outcome) if arrays.probs.shape[1] > 1 else jnp.int32(0)
+        reward = jnp.where(acting, arrays.rewards[action, draw], 0.0)
+        arrived = jnp.where(acting, arrays.successors[action, draw], joint)
     choice_reward = reward_before + discount * reward
     discount = jnp.where(acting, discount * rules.discount, discount)
     elapsed += acting.astype(jnp.int32)
@@ -218,7 +267,7 @@ def tick(
     episode_return = runner.episode_return + reward
 
     terminated, at_choice = arrived == end, arrived < num_choices
-    truncated = jnp.bool_(False)
+    truncated = jnp.bool_(False) if outside is None else outside.state.truncated
     if rules.step_limit is not None:
         truncated |= episode_steps >= rules.step_limit
     if rules.decision_limit is not None:
@@ -243,6 +292,8 @@ def tick(
         episode_return=episode_return,
         episode_steps=episode_steps,
         episode_choices=episode_choices,
+        allowed=None if outside is None else outside.allowed,
+        next_allowed=None if outside is None else outside.state.seen.allowed,
     )
     going_on = Runner(
         joint=arrived,
@@ -255,39 +306,107 @@ def tick(
         episode_return=episode_return,
         episode_steps=episode_steps,
         episode_choices=episode_choices,
+        outside=outside,
     )
     # Nothing of an episode is known in the next one: else the last choice would learn from how the next one began.
-    begun = fresh(begin(arrays, restart))
+    if isinstance(arrays, ShownArrays):
+        assert outside is not None
+        begun = after_episode(arrays, end, outside.state)
+    else:
+        begun = fresh(begin(arrays, restart))
     return jax.tree.map(lambda new, same: jnp.where(over, new, same), begun, going_on), event
 
 
+def step_outside(
+    arrays: ShownArrays,
+    end: int,
+    outside: Outside,
+    joint: Int[Array, ""],
+    acting: Bool[Array, ""],
+    given_up: Bool[Array, ""],
+) -> tuple[Outside, Int[Array, ""], Float[Array, ""]]:
+    """A step of the environment where the machines act, and a new episode where the last one was given up; else nothing
+    is asked of it. Returns the joint state and the reward, too."""
+    environment = arrays.environment
+    place = jnp.clip(joint - len(arrays.edges), 0, len(arrays.actions) - 1)
+    action, asks = jnp.where(given_up, ANEW, arrays.actions[place]), acting | given_up
+    step = next_step(environment, jnp.float32(0), environment.hold(outside.state, ~asks), action)
+    landing = jnp.where(given_up, 0, arrays.landing[place])
+    landed = jnp.where(step.terminated, end, arrays.landings[landing, row_of(environment, step.state)])
+    state = jax.tree.map(lambda new, same: jnp.where(asks, new, same), step.state, outside.state)
+    return outside._replace(state=state), jnp.where(asks, landed, joint), jnp.where(acting, step.reward, 0.0)
+
+
+def begin_outside(arrays: ShownArrays, state: HostState) -> Runner:
+    """A run at the beginning of an episode, in this state of the environment."""
+    joint = arrays.landings[0, row_of(arrays.environment, state)]
+    return fresh(joint)._replace(outside=Outside(state, state.seen.allowed))
+
+
+def after_episode(arrays: ShownArrays, end: int, ended: HostState) -> Runner:
+    """The run that follows an episode. Where only the root stopped, the environment has to be asked for another one,
+    which the next tick does."""
+    over = ended.terminated | ended.truncated
+    begun = begin_outside(arrays, arrays.environment.begin_again(ended))
+    waiting = fresh(jnp.int32(end))._replace(outside=Outside(ended, ended.seen.allowed))
+    return jax.tree.map(lambda one, other: jnp.where(over, one, other), begun, waiting)
+
+
+def values_of(
+    table: Float[Array, "N U"],
+    arrays: Arrays | ShownArrays,
+    choice: Int[Array, "*B"],
+    allowed: Bool[Array, " A"] | None,
+) -> Float[Array, "*B U"]:
+    """Q of the edges of a choice, -inf where one leads to forbidden actions only, as long as another does not."""
+    values = table[choice]
+    if allowed is None:
+        return values
+    assert isinstance(arrays, ShownArrays)
+    return jnp.where(open_edges(arrays.firsts[choice], allowed), values, -jnp.inf)
+
+
+def open_edges(firsts: Bool[Array, "*B U A"], allowed: Bool[Array, " A"]) -> Bool[Array, "*B U"]:
+    """Which edges lead to an action that is allowed; all of them where none does, as machines have to go on."""
+    leads = (firsts & jnp.broadcast_to(allowed, firsts.shape)).any(axis=-1)
+    return leads | ~leads.any(axis=-1, keepdims=True)
+
+
 def update(
-    table: Float[Array, "N U"], event: Event, learning_rate: Float[Array, ""]
+    table: Float[Array, "N U"], event: Event, next_row: Float[Array, " U"], learning_rate: Float[Array, ""]
 ) -> tuple[Float[Array, "N U"], Float[Array, ""]]:
-    """One update from the consequences of one choice; none where they are not known. Returns the squared error, too."""
-    next_row = table[event.next_choice]
+    """One update from the consequences of one choice, where `next_row` is Q of the next; none where they are not known.
+    Returns the squared error, too."""
     target = semi_markov_target(event.reward, event.discount, next_row, next_row > -jnp.inf)
     error = jnp.where(event.learned, target - table[event.choice, event.edge], 0.0)
     return table.at[event.choice, event.edge].add(learning_rate * error), jnp.square(error)
 
 
 def substitute(
-    table: Float[Array, "N U"], into: Int[Array, "N+1 P 2"], chain: int, choice: Int[Array, ""]
+    table: Float[Array, "N U"], arrays: Arrays | ShownArrays, into: Int[Array, "N+1 P 2"], chain: int, event: Event
 ) -> Float[Array, "N U"]:
-    """Q of the edges that lead to `choice` in no time, and of those that lead to their choices, by what is known there.
+    """Q of the edges that lead to the event's choice in no time, and of those that lead to their choices, by what is
+    known there.
 
     `into` and `chain` are those of `internal_edges`.
     """
-    changed = choice[None]
+    changed = event.choice[None]
     for _ in range(chain):
-        values = jnp.max(table[changed], axis=1)
+        values = jnp.max(values_of(table, arrays, changed, event.allowed), axis=1)
         before = into[changed]
         table = table.at[before[..., 0], before[..., 1]].set(values[:, None], mode="drop")
         changed = before[..., 0].ravel()
     return table
 
 
-def internal_edges(process: JointProcess) -> tuple[Int[Array, "N+1 P 2"], int]:
+def process_of(environment: Environment, hierarchy: Hierarchy) -> JointProcess | ShownProcess:
+    """The machines in the environment. Raises what `joint_process` and `shown_process` raise."""
+    if isinstance(environment, HostEnvironment):
+        return shown_process(environment, hierarchy)
+    return joint_process(environment, hierarchy)
+
+
+def internal_edges(process: JointProcess | ShownProcess) -> tuple[Int[Array, "N+1 P 2"], int]:
     """The edges, as choice and position, that lead to each choice in no time, filled up with choice N, which is none
     and has none; and how many of them may follow one another."""
     count = process.num_choices
@@ -359,7 +478,7 @@ class JointEpisode(NamedTuple):
     reward: Float[np.ndarray, " E"]
     """Reward of the step; 0 for a choice."""
     next_state: Int[np.ndarray, " E"]
-    """The environment's state afterwards, which the end of the episode does not tell."""
+    """The environment's state afterwards, or the number that it shows; the end of the episode does not tell."""
 
 
 def play_choices(
@@ -371,27 +490,76 @@ def play_choices(
 ) -> JointEpisode:
     """One episode of a policy over choices, of at most `max_steps` primitive steps and `max_choices` choices."""
     begins = np.flatnonzero(process.initial_probs)
-    joint = int(rng.choice(begins, p=process.initial_probs[begins] / process.initial_probs[begins].sum()))
-    joints, edges, rewards, states, steps, choices = [joint], [], [], [], 0, 0
-    while joint != process.end and steps < max_steps:
-        state = process.state[joint]
+    begun = int(rng.choice(begins, p=process.initial_probs[begins] / process.initial_probs[begins].sum()))
+
+    def act(joint: int) -> _Acted:
+        action = joint - process.num_choices
+        draw = rng.choice(process.probs.shape[1], p=process.probs[action])
+        state = process.tables.successors[process.state[joint], process.actions[action], draw]
+        return _Acted(int(process.successors[action, draw]), float(process.rewards[action, draw]), int(state), False)
+
+    at = int(process.state[begun])
+    return _play(process, begun, at, lambda joint: int(policy[joint]), act, max_steps, max_choices)
+
+
+def play_outside(
+    process: ShownProcess,
+    environment: HostEnvironment,
+    table: Float[np.ndarray, "N U"],
+    key: PRNGKeyArray,
+    max_steps: int,
+) -> JointEpisode:
+    """One greedy episode in a new copy of a Gymnasium environment, of at most `max_steps` primitive steps."""
+    now = sample_initial(environment, key)
+    at = int(row_of(environment, now))
+
+    def choose(joint: int) -> int:
+        may = open_edges(jnp.asarray(process.firsts[joint]), now.seen.allowed)
+        return int(np.where(may, table[joint], -np.inf).argmax())
+
+    def act(joint: int) -> _Acted:
+        nonlocal now
+        place = joint - process.num_choices
+        now, reward, terminated = next_step(environment, jnp.float32(0), now, jnp.int32(process.actions[place]))
+        shown = int(row_of(environment, now))
+        landed = process.end if terminated else int(process.landings[process.landing[place], shown])
+        return _Acted(landed, float(reward), shown, bool(now.truncated))
+
+    return _play(process, int(process.landings[0, at]), at, choose, act, max_steps, None)
+
+
+class _Acted(NamedTuple):
+    """What a primitive step of an episode brought."""
+
+    joint: int
+    reward: float
+    state: int
+    cut: bool
+    """Whether a limit of the environment's own ended the episode."""
+
+
+def _play(
+    process: JointProcess | ShownProcess,
+    joint: int,
+    state: int,
+    choose: Callable[[int], int],
+    act: Callable[[int], _Acted],
+    max_steps: int,
+    max_choices: int | None,
+) -> JointEpisode:
+    joints, edges, rewards, states, steps, choices, cut = [joint], [], [], [], 0, 0, False
+    while joint != process.end and steps < max_steps and not cut:
         if joint < process.num_choices:
             if choices == max_choices:
                 break
             choices += 1
-            edge, reward = int(policy[joint]), 0.0
+            edge, reward = choose(joint), 0.0
             joint = int(process.edges[joint, edge])
         else:
-            action = joint - process.num_choices
-            draw = rng.choice(process.probs.shape[1], p=process.probs[action])
-            edge, reward = -1, float(process.rewards[action, draw])
-            state, joint = (
-                process.tables.successors[state, process.actions[action], draw],
-                int(process.successors[action, draw]),
-            )
-            steps += 1
+            edge, steps = -1, steps + 1
+            joint, reward, state, cut = act(joint)
         joints.append(joint)
         edges.append(edge)
         rewards.append(reward)
-        states.append(int(state))
+        states.append(state)
     return JointEpisode(np.array(joints), np.array(edges), np.array(rewards), np.array(states))

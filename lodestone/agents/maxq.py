@@ -27,18 +27,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from lodestone.envs.base import Environment, initial_state, sample_initial
+from lodestone.envs.base import Environment, Step, initial_state, next_step, sample_initial
+from lodestone.envs.host import ANEW, HostEnvironment, Shown
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog
 from lodestone.learning.policies import choose_among, one_for_two
 from lodestone.learning.schedules import Knots, check_knots, piecewise_linear
 from lodestone.options.execution import REWARD_SWITCHES, Rules, uniforms
-from lodestone.planning.enumerated import enumerated, look_up_step
+from lodestone.planning.enumerated import look_up_step, num_rows, row_of, world_of
 from lodestone.planning.tables import tabulate
 from lodestone.subtasks.places import arrange, may_be_running
 from lodestone.subtasks.recursive import polled_policy
 from lodestone.subtasks.task_graph import TaskGraph, TaskTables, tabulate_tasks
 from lodestone.subtasks.values import Known, evaluator
+from lodestone.types import State
 
 EVENTS_PER_ROUND = 32
 """Events between two looks at the schedules."""
@@ -74,6 +76,8 @@ class Learned(NamedTuple):
     inner: Float[Array, " slots"]
     """C~ of the calls of subtasks that have a pseudo-reward; elsewhere it would be the same as C. Empty if there is no
     such subtask."""
+    allowed: Bool[Array, "S A"] | None = None
+    """In a Gymnasium environment, the actions that were allowed when a number was last shown."""
 
 
 class Stack(NamedTuple):
@@ -106,9 +110,9 @@ class Carry(NamedTuple):
     learned: Learned
     stack: Stack
     lesson: Lesson
-    state: Int[Array, ""]
+    state: State
     visited: Int[Array, " L"]
-    """The states of the episode."""
+    """The rows of the episode's states."""
     steps: Int[Array, ""]
     """Steps of the episode."""
     episode_return: Float[Array, ""]
@@ -117,22 +121,24 @@ class Carry(NamedTuple):
 
 
 def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: Rules, steps: int) -> Algorithm:
-    """The algorithm for the training loop; it learns on the tables of the environment. Schedules are fractions of
-    `steps`, primitive steps.
+    """The algorithm for the training loop; it learns on the tables of the environment, or in a Gymnasium environment by
+    the number that this shows. Schedules are fractions of `steps`, primitive steps.
 
     A limit, of steps or of decisions, which are steps here, unwinds the stack without learning from the calls on it;
     only the last action is learned from. Raises `TooManyStates`, `InvalidTaskGraph`, and `InvalidConfig` for rules
-    without a limit or that are about options.
+    that are about options, where there is no limit, and for a Gymnasium environment that shows no number.
     """
     rules.refuse((*REWARD_SWITCHES, "bootstrap_at_limit"), "MAXQ has no options, and takes no limit for an end")
-    limits = [limit for limit in (rules.step_limit, rules.decision_limit) if limit is not None]
-    if not limits:
+    limits = [rules.step_limit, rules.decision_limit]
+    if isinstance(environment, HostEnvironment):
+        limits.append(environment.step_limit)
+    limit = min((each for each in limits if each is not None), default=None)
+    if limit is None:
         raise InvalidConfig("MAXQ remembers the states of an episode, so it needs a step limit.")
-    limit = min(limits)
-    tables = tabulate(environment)
-    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
-    world, num_actions, num_edges = enumerated(tables, environment.action_names), tasks.num_actions, len(tasks.edges)
-    places = arrange(tasks, may_be_running(tasks, tables))
+    tasks, world = tasks_of(config, environment, graph), world_of(environment)
+    num_actions, num_edges = tasks.num_actions, len(tasks.edges)
+    outside = isinstance(world, HostEnvironment)
+    places = arrange(tasks, ~tasks.ends if outside else may_be_running(tasks, tabulate(environment)))
     evaluate, top = evaluator(tasks, places), len(places.calls) - 1
     draws = 1 + sum(edges.shape[1] > 1 for edges in places.calls)
 
@@ -154,8 +160,9 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
     def init(key: PRNGKeyArray) -> Carry:
         start_key, key = jax.random.split(key)
         zeros = jnp.zeros(tasks.num_slots)
+        allowed = jnp.ones((num_rows(world), num_actions), dtype=bool) if outside else None
         return Carry(
-            learned=Learned(zeros, zeros if any(places.otherwise) else jnp.zeros(0)),
+            learned=Learned(zeros, zeros if any(places.otherwise) else jnp.zeros(0), allowed),
             stack=Stack(only_root, no_numbers, no_numbers),
             lesson=no_lesson,
             state=sample_initial(world, start_key),
@@ -168,7 +175,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
 
     def update(carry: Carry, learning_rate: Float[Array, ""]) -> tuple[Learned, Float[Array, ""]]:
         """The next updates of the lesson, those of the latest states first; returns the sum of squared errors, too."""
-        (values, inner), stack, lesson = carry.learned, carry.stack, carry.lesson
+        (values, inner, allowed), stack, lesson = carry.learned, carry.stack, carry.lesson
         loss = jnp.float32(0)
         for offset in range(UPDATES_PER_EVENT if config.all_states else 1):
             number = lesson.done + offset
@@ -183,10 +190,10 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
                 slot = jnp.where(at_place(places.otherwise), slot, -1)
                 inner, _ = _move(inner, slot, weight * at_place(lesson.inner_values), learning_rate)
             loss += jnp.square(error)
-        return Learned(values, inner), loss
+        return Learned(values, inner, allowed), loss
 
     def descend(
-        carry: Carry, known: list[Known], noise: Float[Array, " N"], epsilon: Float[Array, ""]
+        carry: Carry, row: Int[Array, ""], known: list[Known], noise: Float[Array, " N"], epsilon: Float[Array, ""]
     ) -> tuple[Stack, Int[Array, ""]]:
         """Calls down to a primitive action; returns the place that calls it, too."""
         subtask, edge, called_at = (list(leaf) for leaf in carry.stack)
@@ -197,7 +204,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
             here, values, choice = caller == place, known[place].inner_calls, jnp.int32(0)
             if len(values) > 1:
                 choice = choose_among(*one_for_two(next(uniform), epsilon), values, epsilon)
-            call = calls[place][carry.state * len(values) + choice]
+            call = calls[place][row * len(values) + choice]
             edge[place] = jnp.where(here, call, edge[place])
             called_at[place] = jnp.where(here, carry.steps, called_at[place])
             for lower in range(place):
@@ -207,15 +214,20 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         return Stack(tuple(subtask), tuple(edge), tuple(called_at)), caller
 
     def arrive(
-        stack: Stack, caller: Int[Array, ""], steps: Int[Array, ""], state: Int[Array, ""], learned: Learned
-    ) -> tuple[Stack, Lesson]:
-        """What is left of the stack after a step, and what is learned. `caller` is the place that called the action.
+        stack: Stack, caller: Int[Array, ""], steps: Int[Array, ""], arrived: Step, learned: Learned
+    ) -> tuple[Stack, Lesson, Bool[Array, ""]]:
+        """What is left of the stack after a step, what is learned, and whether the root has ended by itself. `caller`
+        is the place that called the action.
 
         A call is learned from when it has ended by itself, not when a subtask above it has. All values can be known
         before the first update, as none of them depends on it: they are those of callers whose calls have ended.
         """
+        state = row_of(world, arrived.state)
         known, residents = evaluate(*learned, state), resident[state]
-        cut = (steps >= limit) & (residents[top] >= 0)
+        limited = steps >= limit
+        if outside:  # where only the step tells what has ended
+            residents, limited = jnp.where(arrived.terminated, -1, residents), arrived.state.truncated
+        cut = limited & (residents[top] >= 0)
         running = [subtask >= 0 for subtask in stack.subtask]
         ended = [runs & (residents[place] != stack.subtask[place]) for place, runs in enumerate(running)]
         values, inner_values, updates, total = [], [], [], jnp.int32(0)
@@ -237,32 +249,52 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
             left |= ended[place]
             subtask[place] = jnp.where(left, -1, subtask[place])
         lesson = Lesson(tuple(values), tuple(inner_values), tuple(updates), jnp.int32(0))
-        return stack._replace(subtask=tuple(subtask)), lesson
+        return stack._replace(subtask=tuple(subtask)), lesson, residents[top] < 0
+
+    def remember(learned: Learned, state: State) -> Learned:
+        """What is allowed in a state."""
+        if learned.allowed is None:
+            return learned
+        return learned._replace(allowed=learned.allowed.at[row_of(world, state)].set(state.seen.allowed))
+
+    def act(
+        state: State, uniform: Float[Array, ""], action: Int[Array, ""], acting: Bool[Array, ""], over: Bool[Array, ""]
+    ) -> tuple[Step, State]:
+        """A step, to be used where `acting`, and how the next episode begins, to be used where this one is `over`."""
+        if not isinstance(world, HostEnvironment):
+            return look_up_step(world, uniform, state, action), initial_state(world, uniform)
+        # Where only the root has ended, the environment has to be asked for another episode.
+        ended = state.terminated | state.truncated
+        asked = world.hold(state, ~(acting | (over & ~ended)))
+        step = next_step(world, uniform, asked, jnp.where(over, ANEW, action))
+        return step, jax.tree.map(partial(jnp.where, ended), world.begin_again(state), step.state)
 
     def event(
         carry: Carry, noise: Float[Array, " N"], epsilon: Float[Array, ""], learning_rate: Float[Array, ""]
     ) -> tuple[Carry, RoundLog]:
         """Some updates; if none is left, an action, or a new episode where the root has been left."""
-        state = carry.state
+        state = row_of(world, carry.state)
         # Written before it is read, or else the compiler copies it all.
         carry = carry._replace(visited=carry.visited.at[carry.steps].set(state, mode="drop"))
         learned, loss = update(carry, learning_rate)
+        learned = remember(learned, carry.state)
         done = carry.lesson.done + (UPDATES_PER_EVENT if config.all_states else 1)
         ready = done >= carry.lesson.updates[top]
         # The root has been left, or had ended where the episode began.
         over = (carry.stack.subtask[top] < 0) | (resident[state, top] < 0)
         acting = ready & ~over
 
-        stack, caller = descend(carry, evaluate(*learned, state), noise, epsilon)
+        stack, caller = descend(carry, state, evaluate(*learned, state), noise, epsilon)
         edge = _at(caller, stack.edge)
         action = jnp.minimum(child_of[edge], num_actions - 1)
-        step = look_up_step(world, noise[-1], state, action)
+        step, begun = act(carry.state, noise[-1], action, acting, ready & over)
         slot = jnp.where(acting, reward_slot[state * num_actions + action], -1)
         values, error = _move(learned.values, slot, step.reward, learning_rate)
         learned = learned._replace(values=values)
         steps = carry.steps + 1
-        left, lesson = arrive(stack, caller, steps, step.state, learned)
-        terminated = resident[step.state, top] < 0  # the root may end before the environment does
+        if outside:  # what is not a step shows nothing
+            learned = remember(learned, jax.tree.map(partial(jnp.where, acting), step.state, carry.state))
+        left, lesson, terminated = arrive(stack, caller, steps, step, learned)
 
         acted = carry._replace(
             stack=left,
@@ -275,7 +307,7 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         restarted = carry._replace(
             stack=carry.stack._replace(subtask=only_root),
             lesson=no_lesson,
-            state=initial_state(world, noise[-1]),
+            state=begun,
             steps=jnp.int32(0),
             episode_return=jnp.float32(0),
         )
@@ -334,6 +366,12 @@ def _select(condition: Bool[Array, ""], one: Carry, other: Carry) -> Carry:
     return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), one, other)
 
 
+def tasks_of(config: MAXQConfig, environment: Environment, graph: TaskGraph) -> TaskTables:
+    """The graph as the learner uses it, in every state of the environment, or for every number that it shows."""
+    tables = Shown(environment) if isinstance(environment, HostEnvironment) else tabulate(environment)
+    return tabulate_tasks(as_configured(config, graph), environment, tables)
+
+
 def as_configured(config: MAXQConfig, graph: TaskGraph) -> TaskGraph:
     """The graph with as much abstraction and as many pseudo-rewards as the learner uses."""
     graph = graph if config.abstraction else graph.without_abstraction()
@@ -345,10 +383,9 @@ def chooser(
 ) -> Callable[[Learned], Int[np.ndarray, "N T S"]]:
     """A function from what N seeds have learned to the edge that each subtask takes in each state; -1 where it has
     ended. Compiled once."""
-    tables = tabulate(environment)
-    tasks = tabulate_tasks(as_configured(config, graph), environment, tables)
+    tasks = tasks_of(config, environment, graph)
     places = arrange(tasks, ~tasks.ends)
-    evaluate, states = evaluator(tasks, places), np.arange(tables.num_states)
+    evaluate, states = evaluator(tasks, places), np.arange(tasks.ends.shape[1])
 
     @jax.jit
     def best(learned: Learned) -> list[Int[Array, "N S"]]:
@@ -372,7 +409,7 @@ def polled_values(
     """What each of N seeds expects of each primitive action where every step asks anew from the root down: the rewards
     and completions along the best path to the action, -inf where there is none. The maximum of a row is the action that
     polling takes, also where pseudo-rewards choose another path than the best."""
-    tasks = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
+    tasks = tasks_of(config, environment, graph)
     choices = chooser(config, environment, graph)(learned)
     return np.stack([_polled_values(tasks, *seed) for seed in zip(np.asarray(learned.values), choices, strict=True)])
 

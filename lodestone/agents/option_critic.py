@@ -26,7 +26,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from lodestone.agents.q_learning import STEPS_PER_ROUND
 from lodestone.envs.base import Environment, Step, inverse_cdf
-from lodestone.envs.host import HostEnvironment
 from lodestone.errors import InvalidConfig
 from lodestone.learning.loop import Algorithm, RoundLog, log_round
 from lodestone.learning.policies import choose, largest
@@ -42,8 +41,7 @@ from lodestone.options.execution import (
     uniforms,
 )
 from lodestone.options.soft import SoftOptions
-from lodestone.planning.enumerated import Enumerated, World, enumerated, num_rows, numbering, row_of
-from lodestone.planning.tables import tabulate
+from lodestone.planning.enumerated import Enumerated, World, num_rows, numbering, row_of, world_of
 
 Critic = Literal["greedy", "on-policy"]
 Order = Literal["theorem", "authors"]
@@ -191,9 +189,7 @@ def option_critic(config: OptionCriticConfig, environment: Environment, rules: R
     reward is not the discounted sum of its steps' rewards or a limit is an end, and for a Gymnasium environment that
     shows no number.
     """
-    if isinstance(environment, HostEnvironment):
-        return option_critic_on_numbers(config, environment, rules, steps)
-    return option_critic_on_numbers(config, enumerated(tabulate(environment), environment.action_names), rules, steps)
+    return option_critic_on_numbers(config, world_of(environment), rules, steps)
 
 
 def option_critic_on_numbers(config: OptionCriticConfig, world: World, rules: Rules, steps: int) -> Algorithm:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices
+from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices, play_outside
 from lodestone.agents.policies import (
     AnyPolicy,
     GoalPolicy,
@@ -20,12 +20,14 @@ from lodestone.agents.policies import (
     UnitedPolicy,
 )
 from lodestone.envs.base import Environment, OutsideEnvironment
-from lodestone.envs.host import visit
+from lodestone.envs.host import HostEnvironment, visit
 from lodestone.learning.evaluation import Episode, Trace, play_episode, trace_episode
 from lodestone.learning.plan_execution import NEXT_PLAN, play_plans, trace_plans
 from lodestone.learning.plan_network import Plan
 from lodestone.learning.united_execution import play_united, trace_united
 from lodestone.options.base import Options
+from lodestone.planning.joint import JointProcess
+from lodestone.planning.shown_joint import ShownProcess
 from lodestone.types import State
 
 MAX_STEPS = 5000
@@ -73,7 +75,8 @@ def play_many(policy: AnyPolicy, key: PRNGKeyArray, episodes: int) -> Episode:
     keys = key[None] if episodes == 1 else jax.random.split(key, episodes)
     if isinstance(policy, MachinePolicy):
         seeds = len(policy.seeds)
-        played = [_of_machines(policy, position, each) for position in range(seeds) for each in keys]
+        with visit(policy.environment):
+            played = [_of_machines(policy, position, each) for position in range(seeds) for each in keys]
         return jax.tree.map(lambda *leaves: np.array(leaves).reshape(seeds, episodes), *played)
 
     def one(learned: PyTree, key: PRNGKeyArray) -> Episode:
@@ -126,10 +129,13 @@ def _of_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> Epi
 
 
 def _play_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray) -> JointEpisode:
-    max_steps = min(policy.rules.step_limit or MAX_STEPS, MAX_STEPS)
+    max_steps, process = min(policy.rules.step_limit or MAX_STEPS, MAX_STEPS), policy.process
+    if isinstance(process, ShownProcess):
+        assert isinstance(policy.environment, HostEnvironment)
+        return play_outside(process, policy.environment, policy.tables[position], key, max_steps)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     edges = greedy_edges(policy.tables[position])
-    return play_choices(policy.process, edges, rng, max_steps, policy.rules.decision_limit)
+    return play_choices(process, edges, rng, max_steps, policy.rules.decision_limit)
 
 
 def record(policy: AnyPolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
@@ -221,33 +227,34 @@ def _in_words(action_names: tuple[str, ...], plan: Plan) -> str:
 
 def _record_machines(policy: MachinePolicy, position: int, key: PRNGKeyArray, agent: str) -> Playback:
     process, table = policy.process, policy.tables[position]
-    episode = _play_machines(policy, position, key)
+    with visit(policy.environment, film=True) as film:
+        episode = _play_machines(policy, position, key)
     names = process.names
-    states, option, chosen, action, values, available = [process.state[episode.joint[0]]], [], [], [], [], []
+    option, chosen, action, values, available = [], [], [], [], []
     at, fresh, row, may = 0, False, np.full(len(names), np.nan, np.float32), np.zeros(len(names), dtype=bool)
-    for joint, edge, after in zip(episode.joint, episode.edge, episode.next_state, strict=False):
+    for joint, edge in zip(episode.joint, episode.edge, strict=False):
         if edge >= 0:
             allowed = process.available[joint]
             row, may = np.full(len(names), np.nan, np.float32), np.zeros(len(names), dtype=bool)
             row[process.name[joint][allowed]], may[process.name[joint][allowed]] = table[joint][allowed], True
             at, fresh = int(process.name[joint, edge]), True
             continue
-        states.append(after)
         option.append(at)
         chosen.append(fresh)
         action.append(process.actions[joint - process.num_choices])
         values.append(row)
         available.append(may)
         fresh = False
-    take = process.tables.space.states
+    if isinstance(process, JointProcess):
+        states = [process.state[episode.joint[0]], *episode.next_state[episode.edge < 0]]
+        every = process.tables.space.states
+        film = [policy.environment.render(jax.tree.map(lambda leaf, at=at: leaf[at], every)) for at in states]
     return Playback(
         agent=agent,
         seed=policy.seeds[position],
         option_names=names,
         action_names=policy.environment.action_names,
-        pictures=np.stack(
-            [policy.environment.render(jax.tree.map(lambda leaf, state=state: leaf[state], take)) for state in states]
-        ),
+        pictures=np.stack(film),
         option=np.array(option),
         chosen=np.array(chosen),
         action=np.array(action),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lodestone.agents.hamq import process_of
 from lodestone.agents.option_critic import Learned
 from lodestone.envs.base import Environment
 from lodestone.envs.task import Task
@@ -24,7 +25,8 @@ from lodestone.options.base import Options
 from lodestone.options.execution import Rules
 from lodestone.options.soft import SoftOptions, numbered_names
 from lodestone.planning.enumerated import numbering
-from lodestone.planning.joint import JointProcess, joint_process
+from lodestone.planning.joint import JointProcess
+from lodestone.planning.shown_joint import ShownProcess
 from lodestone.types import State
 
 
@@ -69,9 +71,9 @@ class MachinePolicy:
     seeds: tuple[int, ...]
 
     @property
-    def process(self) -> JointProcess:
+    def process(self) -> JointProcess | ShownProcess:
         """The machines in the environment."""
-        return joint_process(self.environment, self.hierarchy)
+        return process_of(self.environment, self.hierarchy)
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from jaxtyping import PyTree
 
 from lodestone.agents.deep_option_critic import DeepOptionCriticConfig, deep_option_critic
 from lodestone.agents.dqn import DQNConfig, dqn
-from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq
+from lodestone.agents.hamq import TICKS_PER_ROUND, HAMQConfig, hamq, process_of
 from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.intra_option import IntraOptionConfig, intra_option_q_learning
-from lodestone.agents.maxq import MAXQConfig, as_configured, maxq, polled_values, rounds_for
+from lodestone.agents.maxq import MAXQConfig, maxq, polled_values, rounds_for, tasks_of
 from lodestone.agents.option_critic import OptionCriticConfig, option_critic
 from lodestone.agents.policies import (
     AnyPolicy,
@@ -49,10 +49,8 @@ from lodestone.options.catalogue import goals as ready_made_goals
 from lodestone.options.catalogue import tasks as ready_made_tasks
 from lodestone.options.execution import Rules
 from lodestone.options.soft import numbered_names
-from lodestone.planning.joint import joint_process
-from lodestone.planning.tables import tabulate
 from lodestone.subtasks.catalogue import task_graph
-from lodestone.subtasks.task_graph import TaskGraph, tabulate_tasks
+from lodestone.subtasks.task_graph import TaskGraph
 
 AgentConfig = (
     DQNConfig
@@ -280,24 +278,24 @@ def _plan(
         case HAMQConfig():
             _refuse_options("HAMQ", options, environment)
             hierarchy = hierarchy or machines(environment)
+            # Every tick takes a step, or is a choice that leads straight to another one, or gives an episode up.
+            ticks = length * (configurations(hierarchy).choices_in_a_row + isinstance(environment, OutsideEnvironment))
             return _Plan(
                 algorithm=hamq(config, environment, hierarchy, rules, length),
-                # Every tick takes a step, or is a choice that leads straight to another one.
-                rounds=-(-length * configurations(hierarchy).choices_in_a_row // TICKS_PER_ROUND),
+                rounds=-(-ticks // TICKS_PER_ROUND),
                 of_carry=lambda carry: carry.table,
-                choices=joint_process(environment, hierarchy).names,
+                choices=process_of(environment, hierarchy).names,
                 learned=np.asarray,
                 ends_by_steps=True,
             )
         case MAXQConfig():
             _refuse_options("MAXQ", options, environment)
             graph = graph or task_graph(environment)
-            tables = tabulate_tasks(as_configured(config, graph), environment, tabulate(environment))
             return _Plan(
                 algorithm=maxq(config, environment, graph, rules, length),
                 rounds=rounds_for(graph, length),
                 of_carry=lambda carry: carry.learned,
-                choices=tables.edge_names,
+                choices=tasks_of(config, environment, graph).edge_names,
                 learned=lambda learned: jnp.asarray(polled_values(config, environment, graph, learned)),
                 ends_by_steps=True,
             )

@@ -23,8 +23,7 @@ from lodestone.cli.parsing import check_seeds, parse, settings_of, take_environm
 from lodestone.cli.printing import note, print_json
 from lodestone.console import ConsoleProgress
 from lodestone.envs.base import Environment, OutsideEnvironment
-from lodestone.envs.host import Registered
-from lodestone.envs.registry import describe_environment
+from lodestone.envs.registry import describe_environment, name_of
 from lodestone.errors import InvalidConfig, InvalidTaskGraph, TooManyStates
 from lodestone.experiments.magnet_tower import OPTION_CAP
 from lodestone.learning.history import History
@@ -137,9 +136,7 @@ def train_run(run: Run, folder: RunFolder | None) -> tuple[AnyPolicy, History]:
             checkpoints = stack.enter_context(folder.checkpoints(run.checkpoint_every, note))
         elif folder is not None:
             note("A Gymnasium environment keeps its state to itself: there are no checkpoints, a run begins again.")
-        world = run.environment
-        name = world.id if isinstance(world, Registered) else describe_environment(world)["name"]
-        progress.begin(f"{run.agent_name} on {name}", 1.0)
+        progress.begin(f"{run.agent_name} on {name_of(run.environment)}", 1.0)
 
         def tell(history: History, fraction: float) -> bool:
             seeds = range(len(run.seeds))

@@ -141,6 +141,11 @@ class HostEnvironment(OutsideEnvironment):
             )
         return self.copies.count
 
+    @property
+    def step_limit(self) -> int | None:
+        """Steps after which an episode is truncated, as far as Gymnasium's `TimeLimit` does it."""
+        return self.copies.step_limit
+
     def render(self, state: HostState) -> UInt8[np.ndarray, "height width 3"]:
         raise NotImplementedError("A copy can only show what it is now.")
 
@@ -159,6 +164,13 @@ class Shown(eqx.Module):
     def size(self) -> int:
         """How many there are. Raises `InvalidConfig` where an observation is no number."""
         return self.environment.num_states
+
+    @property
+    def states(self) -> HostState:
+        """All of them, stacked along a leading axis: a number each. Nothing else is known of such a state."""
+        unknown = cast(Any, None)
+        seen = Seen(jnp.arange(self.size), unknown)
+        return HostState(unknown, unknown, seen, unknown, unknown, unknown, unknown)
 
     def index_of(self, state: HostState) -> Int[Array, ""]:
         """The number that a state shows."""
@@ -257,6 +269,8 @@ class Copies:
             raise InvalidConfig(f"Its actions are {actions}, but agents here choose among discrete ones.")
         self._first_action = int(actions.start)
         self.action_names = _action_names(self._spare, int(actions.n))
+        limited = self._spare.has_wrapper_attr("_max_episode_steps")
+        self.step_limit: int | None = self._spare.get_wrapper_attr("_max_episode_steps") if limited else None
         self.count: int | None = None
         """Of numbers that an observation may be, where it is one."""
         self._first_number = 0
@@ -294,7 +308,7 @@ class Copies:
     def step(
         self, copy: Int[Array, "*B"], clock: Int[Array, "*B"], action: Int[Array, "*B"]
     ) -> tuple[np.ndarray, np.ndarray, Seen, np.ndarray, np.ndarray, np.ndarray, Seen]:
-        """One step of each, but of those that are held still; the fields of `HostState`."""
+        """One step of each, but of those that are held still; the fields of `HostState`. `ANEW` is no step."""
         numbers, clocks, actions = (np.asarray(each) for each in (copy, clock, action))
         shape = numbers.shape
         if np.unique(numbers).size < numbers.size:
@@ -306,6 +320,11 @@ class Copies:
             if clocks[at] < self._clocks[number]:  # held still, or over in a loop that runs until the last one is
                 continue
             one = self._living[number]
+            if actions[at] == ANEW:
+                self._put(seen, at, *self._guard(one.reset))
+                self._clocks[number] += 1
+                self._photograph(number)
+                continue
             shown, reward, ended, cut, info = self._guard(partial(one.step, int(actions[at]) + self._first_action))
             self._clocks[number] += 1
             self._photograph(number)
@@ -340,6 +359,9 @@ class Copies:
             self.failure = error
             raise
 
+
+ANEW = -1
+"""In place of an action: the episode is given up, and the next one begins."""
 
 _COPIES: dict[HostEnvironment, Copies] = {}
 

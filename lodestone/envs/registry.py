@@ -11,7 +11,7 @@ from lodestone.envs.chain import Chain
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.four_rooms import FourRooms
 from lodestone.envs.goal_maze import GoalMaze
-from lodestone.envs.host import Registered
+from lodestone.envs.host import HostEnvironment, Registered
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.random_mdp import RandomMDP
 from lodestone.envs.taxi import Taxi
@@ -57,6 +57,13 @@ def make_environment(name: str, **parameters: Any) -> Environment:
         if colon and module not in (*PLUGINS, *sys.modules):
             raise InvalidConfig(f"The environment is of the module {module}, which has to be imported before.")
     return environment(**parameters)
+
+
+def name_of(environment: Environment) -> str:
+    """What a person calls it: its name, or its id where Gymnasium makes it."""
+    if isinstance(environment, HostEnvironment):
+        return environment.id if isinstance(environment, Registered) else type(environment).__name__
+    return str(describe_environment(environment)["name"])
 
 
 def describe_environment(environment: Environment) -> dict[str, Any]:

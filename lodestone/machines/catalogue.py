@@ -5,7 +5,7 @@ from __future__ import annotations
 from lodestone.envs.base import Environment
 from lodestone.envs.corridor_maze import CorridorMaze
 from lodestone.envs.magnet_arm import MagnetArm
-from lodestone.envs.registry import describe_environment
+from lodestone.envs.registry import name_of
 from lodestone.envs.taxi import Taxi
 from lodestone.errors import InvalidConfig
 from lodestone.machines.corridor_maze import walk_corridors
@@ -23,8 +23,10 @@ def machines(environment: Environment) -> Hierarchy:
             return get_and_put(environment)
         case CorridorMaze():
             return walk_corridors(environment)
-    name = describe_environment(environment)["name"]
-    raise InvalidConfig(f"There are no ready-made machines for {name}; magnet-arm, taxi and corridor-maze have some.")
+    raise InvalidConfig(
+        f"There are no ready-made machines for {name_of(environment)}; magnet-arm, taxi and corridor-maze have some, "
+        "and `train_policy` takes others as `hierarchy`."
+    )
 
 
 def machines_as_options(environment: Environment, options: tuple[str, ...], others: tuple[Machine, ...]) -> Hierarchy:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from lodestone.envs.base import Environment, Step, inverse_cdf
 from lodestone.envs.host import HostEnvironment, Shown
 from lodestone.envs.state_space import Numbers, StateSpace, reachable_states
-from lodestone.planning.tables import Tables
+from lodestone.planning.tables import Tables, tabulate
 from lodestone.types import Observation, State
 
 
@@ -62,6 +62,13 @@ class Enumerated(Environment):
 
 World = Enumerated | HostEnvironment
 """What a tabular learner acts in: numbered states, or a Gymnasium environment that shows a number."""
+
+
+def world_of(environment: Environment) -> World:
+    """Where a tabular learner of an environment acts. Raises `TooManyStates`."""
+    if isinstance(environment, HostEnvironment):
+        return environment
+    return enumerated(tabulate(environment), environment.action_names)
 
 
 def num_rows(world: World) -> int:

@@ -15,19 +15,18 @@ environment says so, wherever the machines are, and where the root stops.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from lodestone.envs.base import Environment
-from lodestone.errors import InvalidMachine, LodestoneError, TooManyStates
-from lodestone.machines.configurations import END, Configurations, check, configurations, takes_time
-from lodestone.machines.machine import Action, Branch, Choice, Hierarchy, Predicate, pairs
+from lodestone.errors import LodestoneError
+from lodestone.machines.configurations import END, Configurations
+from lodestone.machines.machine import Hierarchy
+from lodestone.planning.landing import Machines, choices_of, land, machines_over, numbers_of, reach
 from lodestone.planning.solve import (
     check_discount,
     factorise,
@@ -35,11 +34,7 @@ from lodestone.planning.solve import (
     optimal_choices,
     solve_chain,
 )
-from lodestone.planning.tables import Tables, state_batches, state_text, tabulate
-from lodestone.types import State
-
-MAX_PAIRS = 200_000_000
-"""Environment states times configurations, reachable or not: four bytes each while the joint states are found."""
+from lodestone.planning.tables import Tables, state_text, tabulate
 
 
 class JointProcess(NamedTuple):
@@ -94,7 +89,8 @@ class JointProcess(NamedTuple):
         """A joint state for a person to read."""
         if number == self.end:
             return "the end of the episode"
-        return _pair_text(self.tables, self.configurations, self.state[number], self.configuration[number])
+        configuration = self.configurations.text(int(self.configuration[number]))
+        return f"{configuration} where {state_text(self.tables.space, int(self.state[number]))}"
 
     def initial_mean(self, values: Float[np.ndarray, " J"]) -> float:
         """Mean of `values` over the joint states where episodes begin; an infinite value elsewhere does no harm."""
@@ -236,110 +232,31 @@ def hierarchical_optimum(environment: Environment, hierarchy: Hierarchy, discoun
 # ------------------------------------------------------------------------------------------------------------ building
 
 
-class _Machines(NamedTuple):
-    """The configurations as arrays: C configurations, F edges at most, P lists of answers."""
-
-    configurations: Configurations
-    following: Int[np.ndarray, "C F"]
-    """What follows along each edge; `END` also where there is no such edge."""
-    passes: Bool[np.ndarray, " C"]
-    """Which take no time and leave no choice."""
-    is_choice: Bool[np.ndarray, " C"]
-    branch: Int[np.ndarray, " C"]
-    """The row of `answers` that a branch goes by; -1 for what is none."""
-    condition: Int[np.ndarray, "C F"]
-    """The row of `answers` that tells whether an edge of a choice may be taken; -1 where it always may, and -2 where
-    there is no such edge."""
-    answers: Int[np.ndarray, "P S"]
-    """In each state of the environment, the edge of a branch, or -1 if it has none; or whether a predicate holds."""
-
-
 @lru_cache(maxsize=4)
 def _joint_process(environment: Environment, hierarchy: Hierarchy) -> JointProcess:
-    check(hierarchy, environment)
-    tables, found = tabulate(environment), configurations(hierarchy)
-    if tables.num_states * found.size > MAX_PAIRS:
-        raise TooManyStates(
-            f"{tables.num_states:,} states times {found.size:,} configurations are more than {MAX_PAIRS:,}, which is "
-            "as many as joint states are looked for among."
-        )
-    machines = _machines(environment, tables, found)
-    action_of = np.array(
-        [
-            environment.action_names.index(vertex.action) if isinstance(vertex, Action) and takes_time(vertex) else -1
-            for vertex in found.vertices
-        ]
-    )
-
+    tables = tabulate(environment)
+    machines = machines_over(environment, hierarchy, tables.space, tables.terminal)
     begins = np.flatnonzero(tables.initial_probs)
-    begins_at = _landing(machines, tables, begins, np.zeros_like(begins))
-    known = np.zeros(tables.num_states * found.size, dtype=bool)
-    levels: list[Int[np.ndarray, " B"]] = []
-    frontier = begins_at
-    while True:
-        frontier = np.unique(frontier[frontier >= 0])
-        frontier = frontier[~known[frontier]]
-        if not len(frontier):
-            break
-        known[frontier] = True
-        levels.append(frontier)
-        state, configuration = np.divmod(frontier, found.size)
-        choosing = machines.is_choice[configuration]
-        chosen = _after_choice(machines, tables, state[choosing], configuration[choosing])
-        acted = _after_action(machines, tables, action_of, state[~choosing], configuration[~choosing])
-        frontier = np.concatenate([chosen.ravel(), acted.ravel()])
-    return _assemble(machines, tables, action_of, np.concatenate([*levels, np.zeros(0, np.int64)]), begins, begins_at)
+    begins_at = land(machines, begins, np.zeros_like(begins))
+    pair = reach(machines, begins_at, partial(_after_action, machines, tables))
 
-
-def _assemble(
-    machines: _Machines,
-    tables: Tables,
-    action_of: Int[np.ndarray, " C"],
-    pair: Int[np.ndarray, " J-1"],
-    begins: Int[np.ndarray, " I"],
-    begins_at: Int[np.ndarray, " I"],
-) -> JointProcess:
-    """The process of the joint states that were found, each given as state * C + configuration."""
-    found = machines.configurations
-    configuration = pair % found.size
-    pair = pair[np.argsort(~machines.is_choice[configuration], kind="stable")]
-    state, configuration = np.divmod(pair, found.size)
+    state, configuration = np.divmod(pair, machines.configurations.size)
     size, num_choices = len(pair), int(machines.is_choice[configuration].sum())
-    number = np.full(tables.num_states * found.size + 1, size, dtype=np.int32)  # the pair -1, the end, is the last
-    number[pair] = np.arange(size)
-
     choosing, acting = slice(0, num_choices), slice(num_choices, size)
-    edges = number[_after_choice(machines, tables, state[choosing], configuration[choosing])]
-    conditions = machines.condition[configuration[choosing], : edges.shape[1]]
-    held = machines.answers[np.maximum(conditions, 0), state[choosing, None]] > 0
-    available = (conditions == -1) | ((conditions >= 0) & held)
-    if not available.any(axis=1).all():
-        stuck = int(np.argmin(available.any(axis=1)))
-        raise InvalidMachine(
-            f"No edge may be taken in {_pair_text(tables, found, state[stuck], configuration[stuck])}."
-        )
-
-    names = dict.fromkeys(
-        name for vertex in found.vertices if isinstance(vertex, Choice) for name, _ in pairs(vertex.edges)
-    )
-    position = {name: index for index, name in enumerate(names)}
-    name_of = np.zeros_like(machines.following)
-    for each, vertex in enumerate(found.vertices):
-        if isinstance(vertex, Choice):
-            name_of[each, : len(vertex.edges)] = [position[name] for name, _ in pairs(vertex.edges)]
-
-    actions = action_of[configuration[acting]]
+    number = numbers_of(machines, pair)
+    choices = choices_of(machines, state[choosing], configuration[choosing], number)
+    actions = machines.action[configuration[acting]]
     process = JointProcess(
         tables=tables,
-        configurations=found,
+        configurations=machines.configurations,
         state=np.append(state, -1).astype(np.int32),
         configuration=np.append(configuration, -1).astype(np.int32),
-        edges=edges,
-        available=available,
-        names=tuple(names),
-        name=name_of[configuration[choosing], : edges.shape[1]].astype(np.int32),
+        edges=choices.edges,
+        available=choices.available,
+        names=choices.names,
+        name=choices.name,
         actions=actions.astype(np.int32),
-        successors=number[_after_action(machines, tables, action_of, state[acting], configuration[acting])],
+        successors=number[_after_action(machines, tables, state[acting], configuration[acting])],
         probs=tables.probs[state[acting], actions],
         rewards=tables.rewards[state[acting], actions],
         initial_probs=np.bincount(number[begins_at], tables.initial_probs[begins], minlength=size + 1),
@@ -350,107 +267,16 @@ def _assemble(
     return process
 
 
-def _after_choice(
-    machines: _Machines, tables: Tables, state: Int[np.ndarray, " B"], configuration: Int[np.ndarray, " B"]
-) -> Int[np.ndarray, "B U"]:
-    """Pair that every edge of some choices leads to; -1 for the end, where it may not be taken or does not exist."""
-    widths = (machines.condition > -2).sum(axis=1)[machines.is_choice]
-    width = int(max(widths, default=1))
-    conditions = machines.condition[configuration, :width]
-    taken = (conditions == -1) | (machines.answers[np.maximum(conditions, 0), state[:, None]] > 0) & (conditions >= 0)
-    following = np.where(taken, machines.following[configuration, :width], END)
-    states = np.broadcast_to(state[:, None], following.shape)
-    return _landing(machines, tables, states.ravel(), following.ravel()).reshape(following.shape)
-
-
 def _after_action(
-    machines: _Machines,
-    tables: Tables,
-    action_of: Int[np.ndarray, " C"],
-    state: Int[np.ndarray, " B"],
-    configuration: Int[np.ndarray, " B"],
+    machines: Machines, tables: Tables, state: Int[np.ndarray, " B"], configuration: Int[np.ndarray, " B"]
 ) -> Int[np.ndarray, "B K"]:
     """Pair that each of nature's draws leads to; -1 for the end."""
-    states = tables.successors[state, action_of[configuration]]
+    action = machines.action[configuration]
+    states = tables.successors[state, action]
     following = np.broadcast_to(machines.following[configuration, :1], states.shape)
     # What has no probability is not reached, and is not asked about.
-    following = np.where(tables.probs[state, action_of[configuration]] > 0, following, END)
-    return _landing(machines, tables, states.ravel(), following.ravel()).reshape(states.shape)
-
-
-def _landing(
-    machines: _Machines, tables: Tables, state: Int[np.ndarray, " B"], configuration: Int[np.ndarray, " B"]
-) -> Int[np.ndarray, " B"]:
-    """The pairs, state * C + configuration, where the machines next choose or act in these states; -1 for the end."""
-    here = np.where(tables.terminal[state], END, configuration)
-    moving = np.flatnonzero((here != END) & machines.passes[here])
-    while len(moving):
-        at, among = here[moving], state[moving]
-        row = machines.branch[at]
-        edge = np.where(row >= 0, machines.answers[np.maximum(row, 0), among], 0)
-        if (edge < 0).any():
-            stuck = int(np.argmax(edge < 0))
-            raise InvalidMachine(
-                "The predicate of a branch has an answer without an edge in "
-                f"{_pair_text(tables, machines.configurations, among[stuck], at[stuck])}."
-            )
-        here[moving] = machines.following[at, edge]
-        moving = moving[(here[moving] != END) & machines.passes[here[moving]]]
-    return np.where(here == END, -1, state.astype(np.int64) * machines.configurations.size + here)
-
-
-def _machines(environment: Environment, tables: Tables, found: Configurations) -> _Machines:
-    width = max(map(len, found.followers))
-    following = np.full((found.size, width), END)
-    branch, condition = np.full(found.size, -1), np.full((found.size, width), -2)
-    rows: dict[tuple[Predicate, tuple[int, ...] | None], int] = {}
-    for number, vertex in enumerate(found.vertices):
-        following[number, : len(found.followers[number])] = found.followers[number]
-        if isinstance(vertex, Branch):
-            labels = tuple(int(label) for label, _ in pairs(vertex.edges))
-            branch[number] = rows.setdefault((vertex.on, labels), len(rows))
-        if isinstance(vertex, Choice):
-            conditions = dict(pairs(vertex.only_if))
-            for edge, (name, _) in enumerate(pairs(vertex.edges)):
-                needed = conditions.get(name)
-                condition[number, edge] = -1 if needed is None else rows.setdefault((needed, None), len(rows))
-
-    asked = {predicate: _ask_everywhere(environment, tables, predicate) for predicate in {key[0] for key in rows}}
-    answers = np.zeros((max(len(rows), 1), tables.num_states), dtype=np.int32)
-    for (predicate, edge_labels), row in rows.items():
-        if edge_labels is None:
-            answers[row] = asked[predicate] != 0
-        else:
-            answers[row] = -1
-            for edge, label in enumerate(edge_labels):
-                answers[row][asked[predicate] == label] = edge
-    is_choice = np.array([isinstance(vertex, Choice) for vertex in found.vertices])
-    passes = np.array([not takes_time(vertex) for vertex in found.vertices]) & ~is_choice
-    return _Machines(found, following, passes, is_choice, branch, condition, answers)
-
-
-def _ask_everywhere(environment: Environment, tables: Tables, predicate: Predicate) -> Int[np.ndarray, " S"]:
-    """What a predicate answers in every state. Raises `InvalidMachine` where that is not one bool or integer."""
-    arguments = dict(pairs(predicate.arguments))
-
-    @jax.jit
-    def ask(states: State) -> Array:
-        return jax.vmap(lambda state: jnp.asarray(predicate.function(environment, state, **arguments)))(states)
-
-    answers = []
-    for rows, states in state_batches(tables.space):
-        answers.append(np.asarray(ask(states))[: rows.stop - rows.start])
-    answer = np.concatenate(answers)
-    if answer.ndim != 1 or not (answer.dtype == bool or np.issubdtype(answer.dtype, np.integer)):
-        raise InvalidMachine(
-            f"{predicate.function.__name__} must answer with one bool or integer, but answers with "
-            f"{answer.dtype} {list(answer.shape[1:])}."
-        )
-    return answer.astype(np.int32)
-
-
-def _pair_text(tables: Tables, found: Configurations, state: int, configuration: int) -> str:
-    return f"{found.text(int(configuration))} where {state_text(tables.space, int(state))}"
+    following = np.where(tables.probs[state, action] > 0, following, END)
+    return land(machines, states.ravel(), following.ravel()).reshape(states.shape)
 
 
 # ------------------------------------------------------------------------------------------------------------- solving

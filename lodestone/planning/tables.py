@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import sparse
 
 from lodestone.envs.base import Environment
+from lodestone.envs.host import Shown
 from lodestone.envs.state_space import BATCH, StateSpace, reachable_states
 from lodestone.errors import LodestoneError
 from lodestone.types import State
@@ -138,7 +139,7 @@ def _tabulate(environment: Environment) -> Tables:
     return tables
 
 
-def state_batches(space: StateSpace) -> Iterator[tuple[slice, State]]:
+def state_batches(space: StateSpace | Shown) -> Iterator[tuple[slice, State]]:
     """All states in batches of `BATCH`, each with the numbers it holds; the last one is filled up with copies of the
     last state, so that one compiled shape serves all."""
     for start in range(0, space.size, BATCH):
@@ -146,7 +147,7 @@ def state_batches(space: StateSpace) -> Iterator[tuple[slice, State]]:
         yield slice(start, min(start + BATCH, space.size)), _take(space.states, numbers)
 
 
-def state_text(space: StateSpace, number: int) -> str:
+def state_text(space: StateSpace | Shown, number: int) -> str:
     """A state for a person to read, such as `bricks=[1, 1], row=0`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(_take(space.states, number))
     names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lodestone.envs.base import Environment
-from lodestone.envs.registry import describe_environment
+from lodestone.envs.registry import name_of
 from lodestone.envs.taxi import Taxi
 from lodestone.envs.two_rooms import TwoRooms
 from lodestone.errors import InvalidConfig
@@ -19,5 +19,7 @@ def task_graph(environment: Environment) -> TaskGraph:
             return taxi_tasks(environment)
         case TwoRooms():
             return two_rooms_tasks(environment)
-    name = describe_environment(environment)["name"]
-    raise InvalidConfig(f"There is no ready-made task graph for {name}; taxi and two-rooms have one.")
+    raise InvalidConfig(
+        f"There is no ready-made task graph for {name_of(environment)}; taxi and two-rooms have one, and "
+        "`train_policy` takes others as `graph`."
+    )

@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from lodestone.envs.base import Environment
+from lodestone.envs.host import Shown
+from lodestone.envs.state_space import StateSpace
 from lodestone.errors import InvalidTaskGraph
 from lodestone.planning.tables import Tables, state_batches, state_text
 from lodestone.types import State
@@ -145,7 +147,7 @@ class TaskTables(NamedTuple):
     ends: Bool[np.ndarray, "T S"]
     available: Bool[np.ndarray, "E S"]
     pseudo_rewards: Float[np.ndarray, "T S"]
-    """0 where the subtask goes on."""
+    """0 where the subtask surely goes on."""
     completion_slot: Int[np.ndarray, "E S"]
     """-1 where nothing is stored, because the completion is 0."""
     reward_slot: Int[np.ndarray, "A S"]
@@ -162,8 +164,10 @@ class TaskTables(NamedTuple):
         return tuple(number for number, edge in enumerate(self.edges) if edge.subtask == subtask)
 
 
-def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -> TaskTables:
-    """The graph's predicates in every state of `tables`, which must be those of `environment`.
+def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables | Shown) -> TaskTables:
+    """The graph's predicates in every state of `tables`, which must be those of `environment`, or for every number that
+    a Gymnasium environment shows: an episode may end with any of them, or with none, and a subtask may have ended where
+    `ends` says nothing.
 
     Raises `InvalidTaskGraph` where a child is neither a subtask nor an action, or where a subtask goes on and none of
     its children may be called.
@@ -185,12 +189,18 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
         if name not in actions:
             raise InvalidTaskGraph(f"There is no action {name!r} whose reward could depend on less than the state.")
 
-    everywhere = _answers(graph, tables)
-    ends = np.stack([everywhere[subtask.ends].astype(bool) | tables.terminal for subtask in graph.subtasks])
+    space: StateSpace | Shown
+    if isinstance(tables, Shown):
+        space, terminal = tables, np.zeros(tables.size, dtype=bool)
+    else:
+        space, terminal = tables.space, tables.terminal
+    everywhere = _answers(graph, space)
+    ends = np.stack([everywhere[subtask.ends].astype(bool) | terminal for subtask in graph.subtasks])
     pseudo_rewards = np.zeros(ends.shape)
     for number, subtask in enumerate(graph.subtasks):
         if subtask.pseudo_reward is not None:
-            pseudo_rewards[number] = np.where(ends[number], everywhere[subtask.pseudo_reward], 0.0)
+            may_end = ends[number] | isinstance(tables, Shown)
+            pseudo_rewards[number] = np.where(may_end, everywhere[subtask.pseudo_reward], 0.0)
 
     edges, available, slots, next_slot = [], [], [], 0
     for number, subtask in enumerate(graph.subtasks):
@@ -201,7 +211,7 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
                 allowed = allowed & everywhere[child.when].astype(bool)
             if edge.child >= len(actions):
                 allowed = allowed & ~ends[edge.child - len(actions)]
-            slot = np.full(tables.num_states, -1)
+            slot = np.full(space.size, -1)
             if not child.final:
                 slot[allowed] = next_slot + _classes(everywhere[child.sees] if child.sees else None, allowed)
                 next_slot = max(next_slot, int(slot.max()) + 1)
@@ -211,12 +221,12 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
         stuck = ~ends[number] & ~np.any(available[-len(subtask.children) :], axis=0)
         if stuck.any():
             raise InvalidTaskGraph(
-                f"Subtask {subtask.name!r} goes on in {state_text(tables.space, int(stuck.argmax()))}, but may call "
+                f"Subtask {subtask.name!r} goes on in {state_text(space, int(stuck.argmax()))}, but may call "
                 "none of its children there."
             )
-    live, reward_slots = ~tables.terminal, []
+    live, reward_slots = ~terminal, []
     for name in actions:
-        slot = np.full(tables.num_states, -1)
+        slot = np.full(space.size, -1)
         sees = graph.rewards_see.get(name)
         slot[live] = next_slot + _classes(everywhere[sees] if sees else None, live)
         next_slot = max(next_slot, int(slot.max()) + 1)
@@ -237,6 +247,18 @@ def tabulate_tasks(graph: TaskGraph, environment: Environment, tables: Tables) -
     )
 
 
+def first_actions(tasks: TaskTables) -> Bool[np.ndarray, "S E A"]:
+    """The primitive actions that may come next after each call in each state."""
+    comes = dict(enumerate(np.eye(tasks.num_actions, dtype=bool)))
+    firsts = np.zeros((tasks.ends.shape[1], len(tasks.edges), tasks.num_actions), dtype=bool)
+    for subtask in tasks.bottom_up:
+        edges = list(tasks.edges_of(subtask))
+        for edge in edges:
+            firsts[:, edge] = tasks.available[edge][:, None] & comes[tasks.edges[edge].child]
+        comes[tasks.num_actions + subtask] = np.logical_or.reduce(firsts[:, edges], axis=1)
+    return firsts
+
+
 def actions_below(tasks: TaskTables, subtask: int) -> set[int]:
     """The primitive actions that a subtask, or what it calls, may take."""
     children = {edge.child for edge in tasks.edges if edge.subtask == subtask}
@@ -244,7 +266,7 @@ def actions_below(tasks: TaskTables, subtask: int) -> set[int]:
     return actions.union(*(actions_below(tasks, child - tasks.num_actions) for child in children - actions))
 
 
-def _answers(graph: TaskGraph, tables: Tables) -> dict[Callable[[State], Array], np.ndarray]:
+def _answers(graph: TaskGraph, space: StateSpace | Shown) -> dict[Callable[[State], Array], np.ndarray]:
     """What each of the graph's functions answers in every state; all of them are one compilation."""
     asked = list(graph.rewards_see.values())
     for subtask in graph.subtasks:
@@ -257,7 +279,7 @@ def _answers(graph: TaskGraph, tables: Tables) -> dict[Callable[[State], Array],
         return [jax.vmap(ask)(states) for ask in asked]
 
     batches = []
-    for rows, states in state_batches(tables.space):
+    for rows, states in state_batches(space):
         batches.append([np.asarray(answer)[: rows.stop - rows.start] for answer in ask_batch(states)])
     return {ask: np.concatenate(parts) for ask, parts in zip(asked, zip(*batches, strict=True), strict=True)}
 

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from lodestone.subtasks.places import Places
-from lodestone.subtasks.task_graph import TaskTables
+from lodestone.subtasks.task_graph import TaskTables, first_actions
 
 
 class Known(NamedTuple):
@@ -26,9 +26,12 @@ class Known(NamedTuple):
     """Which call has the largest Q~."""
 
 
-Evaluate = Callable[[Float[Array, " slots"], Float[Array, " slots"], Int[Array, ""]], list[Known]]
-"""(values, inner values, state) -> what is known about each place. The slots are those of `TaskTables`; inner values
-are only looked at where a subtask has a pseudo-reward."""
+Evaluate = Callable[
+    [Float[Array, " slots"], Float[Array, " slots"], Bool[Array, "S A"] | None, Int[Array, ""]], list[Known]
+]
+"""(values, inner values, allowed actions, state) -> what is known about each place. The slots are those of
+`TaskTables`; inner values are only looked at where a subtask has a pseudo-reward. Where actions are forbidden, there is
+no call that leads to such actions only, as long as its caller has another; None where all are allowed."""
 
 
 def evaluator(tasks: TaskTables, places: Places) -> Evaluate:
@@ -37,11 +40,22 @@ def evaluator(tasks: TaskTables, places: Places) -> Evaluate:
     # What is looked up by the state is one row.
     rows = jnp.asarray(np.concatenate([column for columns in looked_up for column in columns], axis=1), dtype=jnp.int32)
     cuts = np.cumsum([column.shape[1] for columns in looked_up for column in columns])[:-1]
+    callers = np.array([edge.subtask for edge in tasks.edges])
+
+    def is_open(allowed: Bool[Array, " A"], state: Int[Array, ""]) -> Bool[Array, " E"]:
+        firsts = jnp.asarray(first_actions(tasks))[state]
+        leads = (firsts & jnp.broadcast_to(allowed, firsts.shape)).any(axis=1)
+        leading = jnp.zeros(len(tasks.ends), dtype=bool).at[callers].max(leads)
+        return leads | ~leading[callers]
 
     def evaluate(
-        values: Float[Array, " slots"], inner_values: Float[Array, " slots"], state: Int[Array, ""]
+        values: Float[Array, " slots"],
+        inner_values: Float[Array, " slots"],
+        allowed: Bool[Array, "S A"] | None,
+        state: Int[Array, ""],
     ) -> list[Known]:
         known: list[Known] = []
+        opened = None if allowed is None else is_open(allowed[state], state)
         row = iter(jnp.split(rows[state], cuts))
         # One number at a time rather than arrays of calls: the compiler makes one loop over seeds of it all.
         for place, columns in enumerate(looked_up):
@@ -56,7 +70,10 @@ def evaluator(tasks: TaskTables, places: Places) -> Evaluate:
                 completion = inner_completion = jnp.where(slot >= 0, values[slot], 0.0)
                 if places.otherwise[place]:
                     inner_completion = jnp.where(slot >= 0, inner_values[slot], 0.0)
-                inner = jnp.where(slot != FORBIDDEN, below + inner_completion, -jnp.inf)
+                there = slot != FORBIDDEN
+                if opened is not None:
+                    there &= opened[jnp.asarray(places.calls[place])[state, number]]
+                inner = jnp.where(there, below + inner_completion, -jnp.inf)
                 better = inner > inner_value
                 inner_value = jnp.where(better, inner, inner_value)
                 value = jnp.where(better, below + completion, value)

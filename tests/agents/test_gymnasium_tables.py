@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -12,21 +14,27 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 
+from lodestone.agents.hamq import HAMQConfig, process_of
 from lodestone.agents.intra_option import IntraOptionConfig
+from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.option_critic import OptionCriticConfig
 from lodestone.agents.playing import play_many, record
-from lodestone.agents.policies import OptionCriticPolicy, Policy
+from lodestone.agents.policies import MachinePolicy, OptionCriticPolicy, Policy
 from lodestone.agents.q_learning import QLearningConfig
 from lodestone.agents.sarsa import SarsaConfig
 from lodestone.agents.saved import load_policy, save_policy
 from lodestone.agents.training import check_training, train_policy
 from lodestone.envs.base import Environment
 from lodestone.envs.host import FromFunction, Registered
-from lodestone.errors import InvalidConfig
+from lodestone.errors import InvalidConfig, InvalidMachine, UnknownName
+from lodestone.machines.machine import Action, Branch, Call, Choice, Hierarchy, Machine, Predicate, Stop, Vertex
 from lodestone.options.base import NO_CAP, Options, Union, primitives
 from lodestone.options.execution import Rules
+from lodestone.planning.joint import joint_process, joint_values
 from lodestone.planning.tables import tabulate
+from lodestone.subtasks.task_graph import Child, Subtask, TaskGraph
 
 FIRST_PLACE, FIRST_ACTION = 3, 5
 
@@ -208,6 +216,247 @@ def test_option_critic_plays_from_a_file(tmp_path):
         play_many(policy, jax.random.key(1), 3), play_many(loaded, jax.random.key(1), 3), strict=True
     ):
         np.testing.assert_array_equal(one, other)
+
+
+def beyond(environment, state, place):
+    del environment
+    return (state if isinstance(state, jax.Array) else state.seen.observation) >= place
+
+
+BEYOND = Predicate(beyond, {"place": 2})
+"""Asked of a state of the corridor, or of the number that is shown."""
+IN_THE_CORRIDOR = Hierarchy(
+    "root",
+    (
+        Machine(
+            "root",
+            "first",
+            {
+                "first": Action("right", then="which"),
+                "which": Choice({"one": "one", "far": "far", "give up": "stop"}, only_if={"give up": BEYOND}),
+                "one": Call("one", then="which"),
+                "far": Branch(BEYOND, {True: "left", False: "right"}),
+                "left": Action("left", then="again"),
+                "again": Action("left", then="which"),
+                "right": Action("right", then="which"),
+                "stop": Stop(),
+            },
+        ),
+        Machine(
+            "one",
+            "way",
+            {
+                "way": Choice({"left": "left", "right": "right"}),
+                "left": Action("left", then="stop"),
+                "right": Action("right", then="stop"),
+                "stop": Stop(),
+            },
+        ),
+    ),
+)
+
+
+def named_as(actions: tuple[str, ...], hierarchy: Hierarchy) -> Hierarchy:
+    """The same where left and right have other names."""
+    names = dict(zip(("left", "right"), actions, strict=True))
+
+    def renamed(vertex: Vertex) -> Vertex:
+        return replace(vertex, action=names[str(vertex.action)]) if isinstance(vertex, Action) else vertex
+
+    machines = (
+        replace(machine, vertices={name: renamed(vertex) for name, vertex in machine.vertices})
+        for machine in hierarchy.machines
+    )
+    return Hierarchy(hierarchy.root, tuple(machines))
+
+
+def test_machines_learn_the_exact_values():
+    """Their root may stop before the episode is over, their choices follow one another in no time, and a limit comes
+    between two of them."""
+    corridor, config = Corridor(step_reward=-4.0), HAMQConfig(((0.0, 1.0),), ((0.0, 1.0),))
+    inside = joint_process(corridor, IN_THE_CORRIDOR)
+    exact = joint_values(inside, DISCOUNT).choice_values
+    wanted = {(inside.state[at], inside.configuration[at]): row for at, row in enumerate(exact)}
+
+    host = outside(corridor, 6)
+    hierarchy = named_as(host.action_names, IN_THE_CORRIDOR)
+    policy, history = train_policy(config, host, primitives(host), Rules(DISCOUNT), 3000, [0, 1], hierarchy=hierarchy)
+    assert isinstance(policy, MachinePolicy)
+    process, learned = policy.process, {}
+    for at in range(process.num_choices):
+        learned[process.state[at], process.configuration[at]] = policy.tables[:, at]
+    for pair, row in wanted.items():
+        np.testing.assert_allclose(learned[pair], [row, row], atol=1e-3)
+    assert 0 < history.episodes(0).success.mean() < 1, "no episode was cut"
+
+    with pytest.raises(InvalidConfig, match="no ready-made machines"):
+        save_policy(Path("nowhere"), policy)
+    best = joint_values(inside, 1.0)
+    played = play_many(policy, jax.random.key(0), 2)
+    np.testing.assert_allclose(played.total_reward, inside.initial_mean(best.values), atol=1e-3)
+    playback = record(policy, 1, jax.random.key(0), "hamq")
+    assert len(playback.pictures) == len(playback.action) + 1 == played.steps[1, 0] + 1
+    np.testing.assert_array_equal(playback.total_reward[-1], played.total_reward[1, 0])
+
+
+def test_machines_choose_nothing_that_leads_to_what_is_forbidden_alone():
+    walk = FromFunction(Walk)
+    back, on = walk.action_names
+    one = {"which": Choice({"go": "go"}), "stop": Stop()}
+    root = {
+        "way": Choice({"back": "back", "on": "on"}),
+        "back": Call("back", then="way"),
+        "on": Call("on", then="way"),
+    }
+    hierarchy = Hierarchy(
+        "root",
+        (
+            Machine("root", "way", root),
+            Machine("back", "which", one | {"go": Action(back, then="stop")}),
+            Machine("on", "which", one | {"go": Action(on, then="stop")}),
+        ),
+    )
+    config = HAMQConfig(((0.0, 1.0),), ((0.0, 1.0),), internal_transitions=True)
+    policy, _ = train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 1500, [0, 1], hierarchy=hierarchy)
+    assert isinstance(policy, MachinePolicy)
+    process = policy.process
+    at = [row for row in range(process.num_choices) if process.configuration[row] == 0 and process.state[row] < 4]
+    back, on = policy.tables[:, at][:, np.argsort(process.state[at])].transpose(2, 0, 1)
+    np.testing.assert_allclose(on, [PLACES, PLACES], atol=1e-3)
+    np.testing.assert_allclose(back[:, 1:], -1 + DISCOUNT * on[:, :3], atol=1e-3)
+    assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
+
+
+def test_machines_have_to_go_on_whatever_is_shown():
+    corridor = outside(Corridor(), 6)
+    vertices = {"ask": Branch(BEYOND, {True: "go"}), "go": Action("0", then="ask")}
+    with pytest.raises(InvalidMachine, match=r"without an edge in root\.ask where seen\.observation=0"):
+        process_of(corridor, Hierarchy("root", (Machine("root", "ask", vertices),)))
+
+
+def never(state):
+    del state
+    return jnp.bool_(False)
+
+
+@pytest.mark.parametrize("goal", [4, None], ids=["the root ends", "the episode ends"])
+def test_subtasks_learn_the_exact_values(goal, tmp_path):
+    """Each of them ends in one place only, so that without a discount no exploration changes what they are worth. The
+    pseudo-reward changes nothing either. Entering a place of the corridor pays its number less 6."""
+    ends = never if goal is None else lambda state: state.seen.observation >= goal
+    corridor = FromFunction(lambda: TimeLimit(Outside(Corridor(6, -6.0), NO_CAP), 9))
+    moves = tuple(map(Child, corridor.action_names))
+    graph = TaskGraph(
+        (
+            Subtask("root", ends, (Child("half"), Child("rest"))),
+            Subtask(
+                "half", lambda state: state.seen.observation >= 3, moves, pseudo_reward=lambda state: jnp.float32(1)
+            ),
+            Subtask("rest", ends, moves),
+        )
+    )
+    config = MAXQConfig(((0.0, 1.0),), ((0.0, 1.0),))
+    policy, history = train_policy(config, corridor, primitives(corridor), Rules(1.0), 1500, [0, 1], graph=graph)
+    assert isinstance(policy, Policy)
+    last = goal or 5
+    worth = np.append(np.cumsum(np.arange(last, 0, -1) - 6.0)[::-1], 0)
+    onward = np.arange(1, last + 1) - 6 + worth[1:]
+    backward = np.maximum(np.arange(last) - 1, 0) - 6 + worth[np.maximum(np.arange(last) - 1, 0)]
+    for learned in np.asarray(policy.learned):
+        np.testing.assert_allclose(learned[:last], np.stack([backward, onward], axis=1), atol=1e-4)
+    episodes = history.episodes(0)
+    assert 0 < episodes.success.mean() < 1, "no episode was cut"
+    assert (episodes.length_steps[~episodes.success] == 9).all()
+    with pytest.raises(UnknownName, match="FromFunction"):
+        save_policy(tmp_path / "policy.safetensors", policy)
+    if goal is None:
+        np.testing.assert_allclose(play_many(policy, jax.random.key(0), 1).total_reward, [[-15], [-15]])
+
+
+def test_subtasks_do_only_what_is_allowed():
+    graph = TaskGraph((Subtask("root", never, (Child("walk"),)), Subtask("walk", never, (Child("0"), Child("1")))))
+    config, walk = MAXQConfig(((0.0, 1.0),), ((0.0, 1.0),)), FromFunction(Walk)
+    with pytest.raises(InvalidConfig, match="needs a step limit"):
+        train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 1500, [0, 1], graph=graph)
+    walk = FromFunction(lambda: TimeLimit(Walk(), 3))
+    policy, _ = train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 1500, [0, 1], graph=graph)
+    assert isinstance(policy, Policy)
+    for learned in np.asarray(policy.learned):
+        np.testing.assert_allclose(learned[:4, 1], PLACES, atol=1e-3)
+        np.testing.assert_allclose(learned[1:4, 0], -1 + DISCOUNT * np.array(PLACES[:3]), atol=1e-3)
+    assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
+
+
+LANDMARKS = (0, 4, 20, 23)
+"""Squares, row by row."""
+ABOARD = 4
+
+
+def taxi(state):
+    """Square, passenger and destination of Gymnasium's number."""
+    number = state.seen.observation
+    return jnp.stack([number // 20, number // 4 % 5, number % 4])
+
+
+def taxi_at(state, landmark):
+    return taxi(state)[0] == LANDMARKS[landmark]
+
+
+def taxi_has(state, what, value):
+    return taxi(state)[what] == value
+
+
+def taxi_graph() -> TaskGraph:
+    """Dietterich's (2000, figure 2), with his abstractions, of the numbers that Gymnasium's taxi shows."""
+
+    def nothing(state):
+        return 0 * state.seen.observation
+
+    def to_each(what: int) -> tuple[Child, ...]:
+        return tuple(
+            Child(f"to-{landmark}", when=partial(taxi_has, what=what, value=landmark), sees=nothing)
+            for landmark in range(4)
+        )
+
+    pickup = Child("4", sees=lambda state: taxi(state)[:2])
+    putdown = Child("5", sees=lambda state: taxi(state)[::2])
+    moves = tuple(Child(str(move), sees=lambda state: taxi(state)[0]) for move in range(4))
+    return TaskGraph(
+        (
+            Subtask("root", never, (Child("get", sees=lambda state: taxi(state)[1:]), Child("put"))),
+            Subtask("get", partial(taxi_has, what=1, value=ABOARD), (pickup, *to_each(1))),
+            Subtask("put", lambda state: taxi(state)[1] != ABOARD, (putdown, *to_each(2))),
+            *(Subtask(f"to-{landmark}", partial(taxi_at, landmark=landmark), moves) for landmark in range(4)),
+        ),
+        dict.fromkeys(map(str, range(4)), nothing),
+    )
+
+
+@pytest.mark.slow
+def test_the_taxi_is_learned_to_its_exact_optimum(tmp_path):
+    """From each of its 300 starts, by what Gymnasium's own tables say; also when it is read from a file."""
+    host = Registered("Taxi-v4")
+    config = MAXQConfig(((0.0, 0.5),), ((0.0, 0.5), (0.8, 0.05)))
+    policy, _ = train_policy(config, host, primitives(host), Rules(1.0), 40_000, [0], graph=taxi_graph())
+    save_policy(tmp_path / "policy.safetensors", policy)
+    loaded = load_policy(tmp_path / "policy.safetensors")
+    assert isinstance(loaded, Policy)
+    learned, inner = np.asarray(loaded.learned)[0], gymnasium.make("Taxi-v4").unwrapped
+    exact = np.zeros(500)
+    for _ in range(40):
+        for state in range(500):
+            steps = [inner.P[state][action][0] for action in range(6)]
+            exact[state] = max(reward + (0 if ended else exact[after]) for _, after, reward, ended in steps)
+    for start in np.flatnonzero(inner.initial_state_distrib):
+        state, total, ended = int(start), 0.0, False
+        for _ in range(30):
+            action = int(np.where(inner.action_mask(state), learned[state], -np.inf).argmax())
+            _, state, reward, ended = inner.P[state][action][0]
+            total += reward
+            if ended:
+                break
+        assert ended
+        assert total == exact[start]
 
 
 def test_observations_that_are_no_number_are_refused():

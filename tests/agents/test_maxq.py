@@ -35,11 +35,11 @@ def learn(config: MAXQConfig, environment: Environment, rules: Rules, steps: int
         if min(history.taken(seed)[1] for seed in range(seeds)) >= steps:
             break
     learned = jax.tree.map(np.asarray, carry.learned)
-    return [Learned(*(leaf[seed] for leaf in learned)) for seed in range(seeds)], history
+    return [jax.tree.map(lambda leaf, seed=seed: leaf[seed], learned) for seed in range(seeds)], history
 
 
 def stacked(seeds: list[Learned]) -> Learned:
-    return Learned(*(np.stack(leaves) for leaves in zip(*seeds, strict=True)))
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *seeds)
 
 
 @pytest.mark.parametrize("pseudo_rewards", [True, False])

@@ -32,7 +32,6 @@ from lodestone.machines.machine import (
 )
 from lodestone.machines.magnet_arm import pull_up
 from lodestone.machines.taxi import get_and_put
-from lodestone.planning import joint
 from lodestone.planning.joint import (
     evaluate_choices,
     expected_choices,
@@ -299,7 +298,7 @@ def test_a_predicate_that_does_not_answer_with_a_bool_or_an_integer_is_refused()
 
 
 def test_too_many_pairs_are_refused(monkeypatch) -> None:
-    monkeypatch.setattr(joint, "MAX_PAIRS", 10)
+    monkeypatch.setattr(landing, "MAX_PAIRS", 10)
     with pytest.raises(TooManyStates, match="5 states times 3 configurations"):
         joint_process(Corridor(), every_action(Corridor()))
 
