@@ -159,12 +159,14 @@ def hamq(config: HAMQConfig, environment: Environment, hierarchy: Hierarchy, rul
     A step limit that comes between two choices ends an episode whose last choice is not learned from, as what would
     have followed is not known; where it comes with a choice, that one bootstraps. A decision limit counts choices.
     `RoundLog.option` is the position of the edge's name in `JointProcess.names`.
-    Raises what `joint_process` raises, `InvalidConfig` for rules about options, and for machines without a choice.
+    Raises what `process_of` raises, and `InvalidConfig` for rules about options and for machines without a choice.
     """
     process = process_of(environment, hierarchy)
     rules.refuse(REWARD_SWITCHES, "HAMQ has no options")
     if process.num_choices == 0:
         raise InvalidConfig("The machines leave no choice open, so there is nothing to learn.")
+    if isinstance(process, ShownProcess) and not len(process.actions):
+        raise InvalidConfig("The machines never act, so a Gymnasium environment would show nothing.")
     arrays: Arrays | ShownArrays
     if isinstance(process, JointProcess):
         arrays = on_device(process)

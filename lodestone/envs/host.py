@@ -222,7 +222,7 @@ def visit(environment: Environment, film: bool = False) -> Iterator[list[UInt8[n
     log.disabled = True
     try:
         yield copies.film if copies.film is not None else []
-    except jax.errors.JaxRuntimeError:
+    except Exception:  # a compiled program raises another one than was raised in it
         if copies.failure is None:
             raise
         failure = f"{type(copies.failure).__name__}: {copies.failure}"

@@ -16,7 +16,7 @@ from corridor import Corridor
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 
-from lodestone.agents.hamq import HAMQConfig, process_of
+from lodestone.agents.hamq import HAMQConfig, hamq, process_of
 from lodestone.agents.intra_option import IntraOptionConfig
 from lodestone.agents.maxq import MAXQConfig
 from lodestone.agents.option_critic import OptionCriticConfig
@@ -40,9 +40,10 @@ FIRST_PLACE, FIRST_ACTION = 3, 5
 
 
 class Walk(gymnasium.Env):
-    """Five places; in the last the walk ends and pays 10. Steps cost 1, after three of them it is cut. Going left is
-    forbidden in the first place."""
+    """Five places; in the last the walk ends and pays a prize. Steps cost 1, after three of them it is cut. Going left
+    is forbidden in the first place."""
 
+    prize = 10.0
     observation_space = spaces.Discrete(5, start=FIRST_PLACE)
     action_space = spaces.Discrete(2, start=FIRST_ACTION)
 
@@ -58,7 +59,13 @@ class Walk(gymnasium.Env):
         self.place, self.time = self.place + (1 if action - FIRST_ACTION else -1), self.time + 1
         assert self.place >= 0, "a forbidden action was taken"
         seen, info = self._see()
-        return seen, 10.0 if self.place == 4 else -1.0, self.place == 4, self.time == 3, info
+        return seen, self.prize if self.place == 4 else -1.0, self.place == 4, self.time == 3, info
+
+
+class DearWalk(Walk):
+    """The same without a prize: what was never tried, and is worth 0, would be best wherever it is allowed."""
+
+    prize = -1.0
 
 
 class BeforeTheEnd(Options):
@@ -84,6 +91,7 @@ class BeforeTheEnd(Options):
 
 DISCOUNT = 0.9
 PLACES = (4.58, 6.2, 8.0, 10.0)
+DEAR_PLACES = (-3.439, -2.71, -1.9, -1.0)
 """What the first four are worth: from the end, each -1 + 0.9 times the next."""
 
 
@@ -300,7 +308,7 @@ def test_machines_learn_the_exact_values():
 
 
 def test_machines_choose_nothing_that_leads_to_what_is_forbidden_alone():
-    walk = FromFunction(Walk)
+    walk = FromFunction(DearWalk)
     back, on = walk.action_names
     one = {"which": Choice({"go": "go"}), "stop": Stop()}
     root = {
@@ -322,7 +330,7 @@ def test_machines_choose_nothing_that_leads_to_what_is_forbidden_alone():
     process = policy.process
     at = [row for row in range(process.num_choices) if process.configuration[row] == 0 and process.state[row] < 4]
     back, on = policy.tables[:, at][:, np.argsort(process.state[at])].transpose(2, 0, 1)
-    np.testing.assert_allclose(on, [PLACES, PLACES], atol=1e-3)
+    np.testing.assert_allclose(on, [DEAR_PLACES, DEAR_PLACES], atol=1e-3)
     np.testing.assert_allclose(back[:, 1:], -1 + DISCOUNT * on[:, :3], atol=1e-3)
     assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
 
@@ -332,6 +340,9 @@ def test_machines_have_to_go_on_whatever_is_shown():
     vertices = {"ask": Branch(BEYOND, {True: "go"}), "go": Action("0", then="ask")}
     with pytest.raises(InvalidMachine, match=r"without an edge in root\.ask where seen\.observation=0"):
         process_of(corridor, Hierarchy("root", (Machine("root", "ask", vertices),)))
+    idle = {"whether": Choice({"at all": "stop"}), "stop": Stop()}
+    with pytest.raises(InvalidConfig, match="never act"):
+        hamq(HAMQConfig(), corridor, Hierarchy("root", (Machine("root", "whether", idle),)), Rules(), 100)
 
 
 def never(state):
@@ -378,12 +389,12 @@ def test_subtasks_do_only_what_is_allowed():
     config, walk = MAXQConfig(((0.0, 1.0),), ((0.0, 1.0),)), FromFunction(Walk)
     with pytest.raises(InvalidConfig, match="needs a step limit"):
         train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 1500, [0, 1], graph=graph)
-    walk = FromFunction(lambda: TimeLimit(Walk(), 3))
+    walk = FromFunction(lambda: TimeLimit(DearWalk(), 3))
     policy, _ = train_policy(config, walk, primitives(walk), Rules(DISCOUNT), 1500, [0, 1], graph=graph)
     assert isinstance(policy, Policy)
     for learned in np.asarray(policy.learned):
-        np.testing.assert_allclose(learned[:4, 1], PLACES, atol=1e-3)
-        np.testing.assert_allclose(learned[1:4, 0], -1 + DISCOUNT * np.array(PLACES[:3]), atol=1e-3)
+        np.testing.assert_allclose(learned[:4, 1], DEAR_PLACES, atol=1e-3)
+        np.testing.assert_allclose(learned[1:4, 0], -1 + DISCOUNT * np.array(DEAR_PLACES[:3]), atol=1e-3)
     assert play_many(policy, jax.random.key(0), 5).success.shape == (2, 5)
 
 
