@@ -32,6 +32,7 @@ from lodestone.machines.machine import (
 )
 from lodestone.machines.magnet_arm import pull_up
 from lodestone.machines.taxi import get_and_put
+from lodestone.planning import landing
 from lodestone.planning.joint import (
     evaluate_choices,
     expected_choices,
