@@ -185,10 +185,9 @@ def outside(environment: Environment, limit: int) -> FromFunction:
     return FromFunction(partial(Outside, environment, limit))
 
 
-@pytest.mark.parametrize("order", ["theorem", "authors"])
-def test_option_critic_learns_the_same_outside(order):
+def test_option_critic_learns_the_same_outside():
     """From the same random numbers, whether the world is a table or shows a number."""
-    corridor, config = Corridor(step_reward=-1.0), OptionCriticConfig(3, temperature=0.5, order=order)
+    corridor, config = Corridor(step_reward=-1.0), OptionCriticConfig(3, temperature=0.5)
     inside, told = train_policy(config, corridor, primitives(corridor), Rules(0.9, 7), 640, [0, 1])
     host = outside(corridor, 7)
     policy, seen = train_policy(config, host, primitives(host), Rules(0.9), 640, [0, 1])
@@ -220,10 +219,10 @@ def test_option_critic_plays_from_a_file(tmp_path):
     policy, _ = train_policy(OptionCriticConfig(2), cliff, primitives(cliff), Rules(), 64, [0, 1])
     save_policy(tmp_path / "policy.safetensors", policy)
     loaded = load_policy(tmp_path / "policy.safetensors")
-    for one, other in zip(
-        play_many(policy, jax.random.key(1), 3), play_many(loaded, jax.random.key(1), 3), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
+    assert isinstance(loaded, OptionCriticPolicy)
+    for found, saved in zip(loaded.learned, policy.learned, strict=True):
+        np.testing.assert_array_equal(found, saved)
+    assert play_many(loaded, jax.random.key(1), 2).steps.max() <= 20
 
 
 def beyond(environment, state, place):
