@@ -134,7 +134,9 @@ def maxq(config: MAXQConfig, environment: Environment, graph: TaskGraph, rules: 
         limits.append(environment.step_limit)
     limit = min((each for each in limits if each is not None), default=None)
     if limit is None:
-        raise InvalidConfig("MAXQ remembers the states of an episode, so it needs a step limit.")
+        raise InvalidConfig(
+            "MAXQ remembers the states of an episode, so it needs a step limit; in Gymnasium its TimeLimit is one."
+        )
     tasks, world = tasks_of(config, environment, graph), world_of(environment)
     num_actions, num_edges = tasks.num_actions, len(tasks.edges)
     outside = isinstance(world, HostEnvironment)
