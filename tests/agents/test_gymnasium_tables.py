@@ -309,7 +309,8 @@ def test_machines_learn_the_exact_values():
 def test_machines_choose_nothing_that_leads_to_what_is_forbidden_alone():
     walk = FromFunction(DearWalk)
     back, on = walk.action_names
-    one = {"which": Choice({"go": "go"}), "stop": Stop()}
+    one_way = {"which": Choice({"go": "go"}), "go": Action(back, then="stop"), "stop": Stop()}
+    either = {"which": Choice({"go": "go", "turn": "turn"}), "go": Action(on, then="stop"), "stop": Stop()}
     root = {
         "way": Choice({"back": "back", "on": "on"}),
         "back": Call("back", then="way"),
@@ -319,8 +320,8 @@ def test_machines_choose_nothing_that_leads_to_what_is_forbidden_alone():
         "root",
         (
             Machine("root", "way", root),
-            Machine("back", "which", one | {"go": Action(back, then="stop")}),
-            Machine("on", "which", one | {"go": Action(on, then="stop")}),
+            Machine("back", "which", one_way),
+            Machine("on", "which", either | {"turn": Action(back, then="stop")}),
         ),
     )
     config = HAMQConfig(((0.0, 1.0),), ((0.0, 1.0),), internal_transitions=True)
