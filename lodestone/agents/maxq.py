@@ -413,11 +413,17 @@ def polled_values(
     polling takes, also where pseudo-rewards choose another path than the best."""
     tasks = tasks_of(config, environment, graph)
     choices = chooser(config, environment, graph)(learned)
-    return np.stack([_polled_values(tasks, *seed) for seed in zip(np.asarray(learned.values), choices, strict=True)])
+    everything = np.ones((len(choices), tasks.ends.shape[1], tasks.num_actions), dtype=bool)
+    allowed = everything if learned.allowed is None else np.asarray(learned.allowed)
+    seeds = zip(np.asarray(learned.values), choices, allowed, strict=True)
+    return np.stack([_polled_values(tasks, *seed) for seed in seeds])
 
 
 def _polled_values(
-    tasks: TaskTables, stored: Float[np.ndarray, " slots"], choices: Int[np.ndarray, "T S"]
+    tasks: TaskTables,
+    stored: Float[np.ndarray, " slots"],
+    choices: Int[np.ndarray, "T S"],
+    allowed: Bool[np.ndarray, "S A"],
 ) -> Float[np.ndarray, "S A"]:
     states = np.arange(tasks.ends.shape[1])
     slots = tasks.completion_slot
@@ -431,7 +437,7 @@ def _polled_values(
             for number in tasks.edges_of(subtask)
         ]
         paths[tasks.num_actions + subtask] = np.max(calls, axis=0)
-    found = np.where(tasks.ends[0][:, None], 0.0, paths[tasks.num_actions])
+    found = np.where(tasks.ends[0][:, None], 0.0, np.where(allowed, paths[tasks.num_actions], -np.inf))
     polled = polled_policy(tasks, choices)
     found[states, polled] = np.nextafter(found.max(axis=1).astype(np.float32), np.float32(np.inf))
     return found.astype(np.float32)
