@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -117,7 +119,8 @@ def _train_all(settings: Sweep, pieces: list[Piece]) -> dict[Path, str]:
     failed: dict[Path, str] = {}
     if not left:
         return failed
-    with ConsoleProgress(len(pieces)) as progress:
+    # Ray tells of a process that died on standard output, where --json writes.
+    with ConsoleProgress(len(pieces)) as progress, redirect_stdout(sys.stderr):
         progress.begin(f"sweep of {len(pieces)} trials", len(pieces))
         done = len(pieces) - len(left)
         progress.skip(done)
