@@ -68,22 +68,22 @@ MAZE_CONFIGS: dict[str, StrawConfig] = {
 }
 
 ARM, ARM_RULES = MagnetArm(rows=4, columns=3, bricks=3, tower_height=3), Rules(discount=0.97, step_limit=200)
-ARM_STEPS = 400_000
+ARM_STEPS = 800_000
 ARM_CONFIG = StrawConfig(
     network=NetworkConfig(kernels=(3,), strides=(3,), channels=(16,), hidden=(128,)),
-    plan=PlanConfig(horizon=1, patch=1, background=20.0),
-    commitment_cost=((0.0, 0.0),),
-    entropy=((0.0, 0.03), (1.0, 0.001)),
-    value_weight=10.0,
+    plan=PlanConfig(horizon=4, patch=4),
+    # While a tower is looked for most steps plan anew; then fewer, to learn what comes second, and that looks cost.
+    sharpness=((0.0, 0.3), (0.4, 0.3), (0.55, 0.15), (0.85, 0.15), (0.97, 1.0)),
+    commitment_cost=((0.0, 0.0), (0.45, 0.0), (0.65, 0.4)),
+    entropy=((0.0, 0.3), (1.0, 0.01)),
     decay=0.9,
-    sharpness=((0.0, 1.0),),
-    learning_rate=((0.0, 1e-3), (0.6, 1e-3), (1.0, 1e-4)),
-    max_gradient_norm=1.0,
+    learning_rate=((0.0, 1e-3), (0.85, 1e-3), (1.0, 1e-4)),
+    adam_epsilon=1e-4,
+    max_gradient_norm=10.0,
     environments=32,
     rollout=8,
-    reward_scale=0.02,
+    reward_scale=0.2,
 )
-"""A new plan, of one step, at every step."""
 WORK = {"grammar": 1.0, PLANNING: 2.0, EVERY_STEP: 2.0, "tower": 8.0}
 """What each part takes, about, beside the others."""
 

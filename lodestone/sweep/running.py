@@ -61,7 +61,10 @@ def run_all(
             )
     except (ImportError, ConnectionError, ValueError, RuntimeError) as error:
         first = _lines(error)[0].rstrip(".")
-        raise InvalidConfig(f"Ray cannot be used at {address or 'this machine'}: {first}.") from None
+        token = ""
+        if address is not None and "RAY_AUTH_MODE" not in os.environ:
+            token = " A cluster that asks for Ray's token needs RAY_AUTH_MODE=token."
+        raise InvalidConfig(f"Ray cannot be used at {address or 'this machine'}: {first}.{token}") from None
     try:
         start = ray.remote(num_cpus=1, max_retries=retries)(work).remote
         waiting = {start(piece): piece for piece in pieces}

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 from collections.abc import Callable, Iterator
@@ -21,6 +23,7 @@ from lodestone.agents.run import load_run
 from lodestone.cli import main
 from lodestone.cli.sweep import Piece
 from lodestone.cli.train import parse_train, run_of
+from lodestone.errors import InvalidConfig
 from lodestone.sweep import running
 from lodestone.sweep.plan import corners, plan_of, trials
 
@@ -179,9 +182,9 @@ class Ray:
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         }
 
-    def start(self) -> subprocess.Popen[str]:
+    def start(self, *where: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [*self._words, "--workers", "2"],
+            [*self._words, *(where or ("--workers", "2"))],
             stdout=subprocess.PIPE,
             text=True,
             env=self._variables,
@@ -232,6 +235,43 @@ def test_fifty_trials_outlive_an_interruption_and_a_worker(tmp_path):
     with ray.start() as process:
         assert json.loads(process.communicate()[0]) == found
     assert ray.results() == after
+
+
+@needs_ray
+@pytest.mark.slow
+def test_a_sweep_on_a_cluster_that_was_there_before(tmp_path, monkeypatch):
+    """And is there afterwards."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    plan, out = written(tmp_path, PLAN.format(draws=2)), tmp_path / "out"
+    with tempfile.TemporaryDirectory() as short:  # sockets have short names
+        words = ["start", "--head", "--block", f"--port={port}", "--num-cpus=2", "--include-dashboard=false"]
+        cluster = subprocess.Popen(
+            [Path(sys.executable).with_name("ray"), *words, f"--temp-dir={short}"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            _wait_for(port, cluster)
+            with Ray(tmp_path, plan, out).start("--address", f"127.0.0.1:{port}") as process:
+                found = json.loads(process.communicate()[0])
+            assert process.returncode == 0
+            assert (found["trials"], found["failed"], len(found["rows"])) == (4, {}, 4)
+            assert cluster.poll() is None
+        finally:
+            os.killpg(cluster.pid, signal.SIGTERM)
+            cluster.wait(60)
+
+
+def _wait_for(port: int, cluster: subprocess.Popen) -> None:
+    while True:
+        assert cluster.poll() is None
+        try:
+            return running.require_answer(f"127.0.0.1:{port}")
+        except InvalidConfig:
+            time.sleep(0.2)
 
 
 def _kill_a_worker(driver: int) -> None:
