@@ -141,6 +141,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """What `write_arrays` wrote. Raises `BadFile` for a missing, truncated or foreign file."""
     _refuse_devices(path)
     try:
+        path.open("rb").close()  # safetensors says of a file that may not be read that there is none
         with safe_open(path, framework="numpy") as file:
             header = (file.metadata() or {}).get(HEADER)
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import jax
@@ -301,6 +303,18 @@ def test_foreign_files_are_refused(content, tmp_path):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(BadFile, match="truncated, or no safetensors"):
         load_policy(tmp_path / "file")
+
+
+def test_a_file_that_may_not_be_read_is_not_said_to_be_missing(tmp_path, monkeypatch):
+    path = tmp_path / "policy.safetensors"
+    path.touch()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(Path, "open", refuse)  # nobody refuses the root that tests may run as
+    with pytest.raises(BadFile, match="cannot be read: Permission denied"):
+        load_policy(path)
 
 
 def test_a_missing_file_is_named(tmp_path):
