@@ -76,7 +76,6 @@ def test_a_short_run_learns_the_grammar_but_not_yet_when_to_look():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="grammar, maze and arm miss some of their numbers: docs/straw.md has them")
 def test_all_numbers_come_out():
     failed = [gate for gate in straw.run(10, Silent()).gates if not gate.passed]
     assert failed == []
