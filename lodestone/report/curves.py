@@ -290,7 +290,7 @@ def panel_svg(draw: Callable[[Axes], None], width: float = 4.5, height: float = 
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(width, height))
         # Fixed margins rather than a computed layout: panels under one another line up.
-        draw(figure.subplots(gridspec_kw={"left": 0.16, "right": 0.985, "bottom": 0.155, "top": 0.97}))
+        draw(figure.subplots(gridspec_kw={"left": 0.16, "right": 0.955, "bottom": 0.155, "top": 0.97}))
         content = BytesIO()
         figure.savefig(
             content, format="svg", transparent=True, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type"))

@@ -145,11 +145,17 @@ def _read_metrics(path: Path, seeds: Sequence[int]) -> tuple[tuple[str, ...], tu
 
 
 def _lines(rows: Sequence[Mapping[str, Any]], choices: tuple[str, ...]) -> Lines:
+    def numbers(values: list[Any], axes: int) -> np.ndarray:
+        found = np.array(values, dtype=np.float64)  # None is not a number
+        if found.ndim != axes:
+            raise ValueError("There is a list in the place of a number.")
+        return found
+
     def column(name: str) -> Float[np.ndarray, " T"]:
-        return np.array([row[name] for row in rows], dtype=np.float64)  # None is not a number
+        return numbers([row[name] for row in rows], 1)
 
     def of_choices(name: str) -> Float[np.ndarray, "T O"]:
-        return np.array([[row[name][choice] for choice in choices] for row in rows], dtype=np.float64)
+        return numbers([[row[name][choice] for choice in choices] for row in rows], 2)
 
     calls = of_choices("calls")
     tell = all("steps_of_calls" in row for row in rows)

@@ -86,9 +86,15 @@ def test_runs_that_differ_in_their_seeds_are_one_learner(tmp_path):
 
 def test_what_cannot_be_reported_is_said(tmp_path):
     run = write(tmp_path / "run", {0: [0.1]})
+    whole = json.loads((run / "metrics.jsonl").read_text().splitlines()[0])
     for text, message in (("", "no line of every seed"), ("{}\n", "is damaged"), ('{"seed": 9}\n', "is damaged")):
         (run / "metrics.jsonl").write_text(text)
         with pytest.raises(BadFile, match=message):
+            read_learners([run])
+    for name in ("steps", "seconds", "mean_return", "calls"):
+        nested = {choice: [number] for choice, number in whole["calls"].items()} if name == "calls" else [whole[name]]
+        (run / "metrics.jsonl").write_text(json.dumps(whole | {name: nested}) + "\n")
+        with pytest.raises(BadFile, match="is damaged"):
             read_learners([run])
     (run / "metrics.jsonl").unlink()
     with pytest.raises(BadFile, match="nothing to report"):
