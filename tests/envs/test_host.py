@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,9 @@ from lodestone.agents.deep_option_critic import DeepOptionCriticConfig
 from lodestone.agents.dqn import DQNConfig, dqn
 from lodestone.agents.hdqn import HDQNConfig, hdqn
 from lodestone.agents.playing import play_many
-from lodestone.agents.policies import Policy
+from lodestone.agents.policies import PlanPolicy, Policy
 from lodestone.agents.saved import load_policy, save_policy
-from lodestone.agents.straw import StrawConfig
+from lodestone.agents.straw import StrawConfig, collect
 from lodestone.agents.training import train_policy
 from lodestone.envs.host import FromFunction, HostEnvironment, Registered, visit
 from lodestone.envs.registry import make_environment
@@ -25,6 +26,8 @@ from lodestone.envs.task import goal
 from lodestone.errors import EnvironmentFailed, InvalidConfig, TooManyStates
 from lodestone.learning.loop import train
 from lodestone.learning.networks import NetworkConfig
+from lodestone.learning.plan_execution import start_planning
+from lodestone.learning.plan_network import PlanConfig, init_plan_network
 from lodestone.options.base import Options, Union, primitives
 from lodestone.options.execution import Rules
 from lodestone.planning.tables import tabulate
@@ -195,6 +198,26 @@ def test_plans_take_what_is_allowed(walk):
     found = [len(history.episodes(seed).total_reward) for seed in range(2)]
     assert sum(found) == sum(one[4] or one[5] for one in LOG)
     assert play_many(policy, jax.random.key(0), 5).success.all()
+
+
+def test_a_plan_that_is_forbidden_is_left_out_of_what_is_learned_and_played(walk):
+    """It lowers the number wherever it may."""
+    one = init_plan_network(SMALL.network, PlanConfig(horizon=2, patch=2), (2,), 3, jax.random.key(0))
+    blank = jax.tree.map(jnp.zeros_like, one)
+    lowers = eqx.tree_at(lambda n: n.patch.bias, blank, jnp.array([9.0, 9.0, 0.0, 0.0, 0.0, 0.0]))
+    config = StrawConfig(network=SMALL.network, environments=3, rollout=20)
+    with visit(walk):
+        actors = jax.vmap(lambda key: start_planning(walk, lowers, key))(jax.random.split(jax.random.key(1), 3))
+        run = jax.jit(lambda actors, key: collect(config, walk, Rules(), lowers, jnp.float32(1), actors, key))
+        taken = jax.tree.map(np.asarray, run(actors, jax.random.key(2))[2])
+    np.testing.assert_array_equal(taken.allowed[..., 0], taken.seen[..., 0] > 0)
+    assert taken.allowed[..., 1].all()
+    assert not taken.allowed.all()
+
+    LOG.clear()
+    policy = PlanPolicy("straw", walk, Rules(), SMALL.network, jax.tree.map(lambda leaf: leaf[None], lowers), 1.0, (0,))
+    assert not play_many(policy, jax.random.key(0), 4).success.any()
+    assert {(one[1] > 0, one[2]) for one in LOG} == {(True, 0), (False, 1)}
 
 
 def test_what_the_environment_raises_is_told(walk):
