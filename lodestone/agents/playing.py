@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from lodestone.agents.hamq import JointEpisode, greedy_edges, play_choices, play_outside
+from lodestone.agents.machine_playing import JointEpisode, greedy_edges, play_choices, play_outside
 from lodestone.agents.policies import (
     AnyPolicy,
     GoalPolicy,

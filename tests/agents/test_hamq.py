@@ -11,11 +11,10 @@ from random_mdp import random_mdp
 from lodestone.agents.hamq import (
     TICKS_PER_ROUND,
     HAMQConfig,
-    greedy_edges,
     hamq,
     internal_edges,
-    play_choices,
 )
+from lodestone.agents.machine_playing import greedy_edges, play_choices
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.taxi import Taxi
 from lodestone.errors import InvalidConfig

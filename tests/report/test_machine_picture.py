@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from machine_interpreter import is_even, random_hierarchy
 
-from lodestone.agents.hamq import play_choices
+from lodestone.agents.machine_playing import play_choices
 from lodestone.envs.magnet_arm import MagnetArm
 from lodestone.envs.taxi import Taxi
 from lodestone.errors import LodestoneError
