@@ -310,7 +310,7 @@ def _tasks_for(
         tasks = ready_made_tasks(environment) if of_options else ready_made_goals(environment)
     if not tasks:
         needs = "A united network learns options by their tasks" if of_options else "h-DQN chooses among goals"
-        raise InvalidConfig(f"{needs}, and this environment has none.")
+        raise InvalidConfig(f"{needs}, and this environment has none; `train_policy` takes others as `tasks`.")
     return tuple(tasks)
 
 
